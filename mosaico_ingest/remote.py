@@ -113,7 +113,7 @@ def _cached_filesystem(root: str, options: str, network: Network, _process: int)
 def _web(root: str, query: str, network: Network) -> FileSystem:
     from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
-    from mosaico_ingest.web_files import WebFiles  # noqa: PLC0415 - as the previous line
+    from mosaico_ingest.web_files import WebFiles  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
 
     return fs.PyFileSystem(WebFiles(root, query, network))
 
@@ -384,7 +384,7 @@ class RemotePath:
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
 
     def _web_version(self) -> str:
-        handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - that of a `PyFileSystem`
+        handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - web URLs have a `PyFileSystem`, which has a handler
         found = handler.properties(self.filesystem_path, cached=False)
         if found is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))

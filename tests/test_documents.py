@@ -148,7 +148,7 @@ def test_site_builds_in_strict_mode_and_loads_nothing_from_other_servers(tmp_pat
 def test_terminal_pictures_show_the_current_output(tmp_path: Path) -> None:
     pytest.importorskip("pty", reason="only POSIX systems have pseudo terminals")
     from terminal import picture_text  # noqa: PLC0415 - it imports pty
-    from terminal_pictures import take_pictures  # noqa: PLC0415 - as above
+    from terminal_pictures import take_pictures  # noqa: PLC0415 - it imports pty
 
     for name, picture in take_pictures(tmp_path):
         stored = (ROOT / "docs" / "images" / f"{name}.svg").read_text(encoding="utf-8")

@@ -271,7 +271,7 @@ def check_small(store: Store) -> None:
     stored = rows(store, "small", "/camera/image_raw")
     assert [(row["format"], row["width"], row["height"]) for row in stored] == [("jpeg", 32, 16)] * 40
     pixel = Image.open(io.BytesIO(stored[20]["data"])).getpixel((3, 3))
-    assert np.abs(np.subtract(pixel, (100, 120, 200))).max() <= 3  # type: ignore[arg-type]
+    assert np.abs(np.subtract(pixel, (100, 120, 200))).max() <= 3  # type: ignore[arg-type] - the pixel has three numbers
 
 
 def check_described(store: Store) -> None:

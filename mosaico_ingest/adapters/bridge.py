@@ -287,7 +287,7 @@ class ROSBridge:
         """Load all adapters; `base_dir` is the folder for relative paths.
 
         `overrides` and `images` are by topic name or glob, `formats` (of types without an adapter) by type. Without
-        `python`, adapters in Python are refused, and those of installed packages and of the program are not used.
+        `python`, references to adapters in Python are refused, and adapters of installed packages and of the program are not used.
 
         Raises:
             AdapterError: An adapter is missing or has a mistake, or two are loaded for one type.

@@ -42,7 +42,7 @@ from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 _FieldPath: TypeAlias = "tuple[str, ...]"
 _ScopePaths: TypeAlias = "tuple[_FieldPath, ...]"
-"""The path of the message in which names are looked up, after those of the messages around it."""
+"""The paths of the messages around an expression, outermost first; names are looked up in the last one."""
 
 
 def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:

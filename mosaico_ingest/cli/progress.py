@@ -68,7 +68,7 @@ class RecordingTally:
 
     @property
     def counted(self) -> list[TopicTally]:
-        """The topics without those that share their messages with another topic."""
+        """The topics, except topics that share their messages with another topic."""
         return [topic for topic in self.topics.values() if not topic.expected.shares_messages]
 
     @property

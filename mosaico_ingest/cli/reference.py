@@ -43,7 +43,7 @@ def _commands(group: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN4
             yield f"{path} {name}", command
 
 
-def _section(path: str, command: Any) -> str:  # noqa: ANN401 - as above
+def _section(path: str, command: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     parameters = [
         each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"
     ]
@@ -70,19 +70,19 @@ def _paragraphs(text: str) -> str:
     return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n\s*\n", text.replace("\b", "")))
 
 
-def _usage(argument: Any) -> str:  # noqa: ANN401 - as above
+def _usage(argument: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     name = _metavar(argument)
     several = "…" if argument.nargs == -1 else ""
     return f"{name}{several}" if argument.required else f"[{name}{several}]"
 
 
-def _metavar(parameter: Any) -> str:  # noqa: ANN401 - as above
+def _metavar(parameter: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     """Return the name of a value, without the brackets that mark optional arguments."""
     name = str(parameter.metavar or parameter.name.upper())
     return name[1:-1] if name.startswith("[") and name.endswith("]") else name
 
 
-def _names(option: Any) -> str:  # noqa: ANN401 - as above
+def _names(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     """Return the names of an option with its value, such as `-n`, `--count N`."""
     *others, long = sorted(option.opts, key=len)
     value = "" if option.is_flag else f" {option.metavar or _choices(option) or 'VALUE'}"
@@ -90,7 +90,7 @@ def _names(option: Any) -> str:  # noqa: ANN401 - as above
     return ", ".join([*(f"`{name}`" for name in others), f"`{long}{value}`", *negative])
 
 
-def _choices(option: Any) -> str:  # noqa: ANN401 - as above
+def _choices(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     """Return the words that an option accepts; the attribute with its type depends on the version of typer."""
     descriptor = getattr(option, "type_descriptor", None)
     kind: Any = descriptor.annotation if descriptor is not None else option.type
@@ -98,7 +98,7 @@ def _choices(option: Any) -> str:  # noqa: ANN401 - as above
     return "|".join(str(getattr(word, "value", word)) for word in words)
 
 
-def _meaning(parameter: Any) -> str:  # noqa: ANN401 - as above
+def _meaning(parameter: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     """Return the help with the default and the environment variable."""
     text = " ".join((parameter.help or "").split())
     default, shown = parameter.default, getattr(parameter, "show_default", True)

@@ -1,4 +1,4 @@
-"""Exports of what a sequence keeps besides rows: metadata records, `custom_data` and attachments."""
+"""Exports of the content that a sequence keeps besides rows: metadata records, `custom_data` and attachments."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Raw images as PNG and JPEG pictures: which encodings fit which format, and what the picture then contains."""
+"""Raw images as PNG and JPEG pictures: the formats that fit each encoding, and the conversion of the samples."""
 
 from __future__ import annotations
 

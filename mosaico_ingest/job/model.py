@@ -211,7 +211,7 @@ class MetadataSources(Section):
 
 
 class KeepSettings(Section):
-    """What a sequence keeps of its recording besides messages; exports write it again."""
+    """Content of the recording, besides messages, that the sequence keeps; exports write it again."""
 
     records: tuple[Text, ...] = Field(default=("*",), examples=[["vehicle", "drive_*"], []])
     """Names or globs of MCAP metadata records, which become the metadata `_records_`."""
@@ -240,7 +240,7 @@ class SequenceSettings(Section):
     metadata_schema: SchemaPath | None = Field(default=None, examples=["fleet/vehicle.schema.json"])
     """A JSON Schema (draft 2020-12) for the final metadata. It may refer to other files (`$ref`), but not to URLs."""
     keep: KeepSettings = KeepSettings()
-    """What the sequence keeps of the recording besides messages."""
+    """Content of the recording, besides messages, that the sequence keeps."""
     if_exists: IfExists = IfExists.FAIL
     """Action if the sequence exists: fail, skip (if its content is the same), append, replace."""
 
@@ -302,8 +302,8 @@ class AdapterSettings(Section):
     """The adapter for a topic name or glob, written as in `load` or as the name of a built-in adapter. The exact topic name
     takes precedence, followed by the first matching glob."""
     python: bool = True
-    """Whether adapters in Python may run. With `false`, a reference to one is an error, and those of installed packages are not
-    used. `ingest --no-python` does the same for every job."""
+    """Whether adapters in Python may run. With `false`, a reference to an adapter in Python is an error, and adapters of
+    installed packages are not used. `ingest --no-python` does the same for every job."""
     unmodeled: Unmodeled = Unmodeled.KEEP
     """Action for a type without an adapter: keep its ROS shape, skip its topics, fail."""
     serialization_formats: dict[Text, Literal["default", "ragged", "image"]] = Field(

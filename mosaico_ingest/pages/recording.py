@@ -320,9 +320,8 @@ def _examples(report: Report) -> list[QuarantinedMessage]:
 
 def _decoded_values(quarantine: Path, selected: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
     """Return the fields of messages by topic and log time; empty for a file that is too large or cannot be read."""
-    # Only pages with quarantined messages need Arrow.
-    from mosaico_ingest.rosbag.loader import ROSLoader  # noqa: PLC0415 - as above
-    from mosaico_ingest.view.values import value_text  # noqa: PLC0415 - as above
+    from mosaico_ingest.rosbag.loader import ROSLoader  # noqa: PLC0415 - only pages with quarantined messages need Arrow
+    from mosaico_ingest.view.values import value_text  # noqa: PLC0415 - only pages with quarantined messages need Arrow
 
     values: dict[tuple[str, int], str] = {}
     try:

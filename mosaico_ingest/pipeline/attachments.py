@@ -1,4 +1,4 @@
-"""What a sequence keeps of its recording besides messages: metadata records, `custom_data` and attachments."""
+"""Content of a recording, besides messages, that its sequence keeps: metadata records, `custom_data` and attachments."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _ROSBAG2_RECORD = "rosbag2"
 
 
 class Kept(Struct, frozen=True):
-    """What a plan keeps of a recording."""
+    """The metadata and attachments that a plan keeps of a recording."""
 
     metadata: Mapping[str, Any]
     """Metadata of the sequence, under reserved keys."""
@@ -37,7 +37,7 @@ class Kept(Struct, frozen=True):
 
 
 def kept_of(job: Job, recording: Recording) -> Kept:
-    """Return what the sequence keeps of a recording, according to `sequence.keep`.
+    """Select the metadata and attachments that the sequence keeps, according to `sequence.keep`.
 
     Raises:
         BagError: The file cannot be read.

@@ -125,7 +125,7 @@ def _state_or_absence(path: Path) -> State:
     try:
         return _state(path, path.stat())
     except FileNotFoundError:
-        return (abspath(path),)  # noqa: PTH100 - as above
+        return (abspath(path),)  # noqa: PTH100 - a link and its target are two paths
 
 
 def _changed_recently(states: Sequence[State]) -> bool:

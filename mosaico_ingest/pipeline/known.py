@@ -24,7 +24,7 @@ _T = TypeVar("_T")
 
 
 def mark_known(tasks: Iterable[Task]) -> Iterator[Task]:
-    """Yield the tasks; those with `if_exists: skip` whose recording is stored, complete and unchanged, are marked as known."""
+    """Yield the tasks, and mark a task as known if it has `if_exists: skip` and its recording is stored, complete and unchanged."""
     for batch in _batches(tasks):
         candidates = [task for task in batch if _may_be_skipped(task)]
         known = iter(known_recordings([task.job for task in candidates]))
@@ -42,7 +42,7 @@ def with_known(jobs: Iterable[Job]) -> Iterator[tuple[Job, bool]]:
 def known_recordings(jobs: Sequence[Job]) -> list[bool]:
     """Return for each job whether its recording is stored, complete and unchanged, according to its fingerprint.
 
-    False means that the recording has to be opened and compared. Errors are not raised here, but when it is opened.
+    False means that the recording has to be opened and compared. Opening the recording raises errors; this function does not.
     """
     positions: dict[tuple[int, Path], list[int]] = defaultdict(list)
     for position, job in enumerate(jobs):

@@ -50,7 +50,7 @@ def latched_blocks(
 def _early_blocks(
     plan: Plan, recording: Recording, static: dict[int, bool], times_of: Callable[[MessageBlock], Int64s]
 ) -> Iterator[MessageBlock]:
-    """Yield the messages of some connections before the time range; of those with an index, at least the latest."""
+    """Yield the messages of some connections before the time range; with an index, at least the latest message of each."""
     if plan.read_from_ns is None or not plan.selects_after_reading:
         yield from _latest_blocks(plan, recording, static)
         return

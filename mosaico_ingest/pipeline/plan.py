@@ -255,7 +255,7 @@ class Plan(Part):
 
     @property
     def read_topics(self) -> tuple[TopicPlan, ...]:
-        """The topics without those that share their messages with another topic."""
+        """The topics, except topics that share their messages with another topic."""
         return tuple(topic for topic in self.topics if not topic.shares_messages)
 
     @property

@@ -35,8 +35,8 @@ MAX_PARTS = 1000
 def split_job(job: Job) -> tuple[Job, ...]:
     """Return a job for each part of the recording that has messages.
 
-    A job without `split` is returned unchanged; so is a job whose recording cannot be opened or has no such part, whose
-    run reports the reason.
+    A job without `split` is returned unchanged. If the recording cannot be opened or has no such part, the job is also
+    returned unchanged, and its run reports the reason.
 
     Raises:
         ManifestError: The event file has mistakes, or the recording would have more than `MAX_PARTS` parts.
@@ -170,7 +170,7 @@ def _event_parts(
 
 
 def _interval(event: Event, recording: Recording) -> tuple[int, int]:
-    """Return the start and end of an event, ns since the epoch; offsets require an index, as those of `bag.time`."""
+    """Return the start and end of an event, ns since the epoch; offsets require an index, as in `bag.time`."""
     if event.start.relative or event.end.relative:
         if recording.start_ns is None or recording.end_ns is None:
             message = f"{event.name!r} has an offset, and the recording has no index, so its start is unknown"

@@ -221,7 +221,7 @@ class Report(ReportPart):
 
     @property
     def counted_topics(self) -> list[TopicReport]:
-        """The topics that were read, without those that share their messages with another topic."""
+        """The topics that were read, except topics that share their messages with another topic."""
         return [
             topic
             for topic in self.topics

@@ -26,10 +26,10 @@ from mosaico_ingest.serve.keys import fingerprint_of
 MAX_REQUEST_BYTES = 256 << 20
 """Default size of the largest body of an action and of the largest message of an upload, in bytes."""
 _BURST_S = 10.0
-"""Seconds of the permitted rate that a caller may use at once after a pause."""
+"""Seconds of the permitted rate that a caller may use immediately after a pause."""
 _HEALTH_TIMEOUT_S = 3.0
 _MAX_CALLERS = 10_000
-"""Number of callers above which those without recent calls are forgotten."""
+"""Number of callers above which callers without recent calls are forgotten."""
 _MAX_TEXT = 300
 """Maximum length of names and errors in the audit log."""
 
@@ -83,7 +83,7 @@ class AuditLog:
 
 @dataclass(slots=True)
 class Call:
-    """What the audit log records about a call."""
+    """The properties of a call that the audit log records."""
 
     name: str
     """`get`, `put`, `list_flights`, `get_flight_info`, `get_schema`, or the name of the action."""
@@ -113,7 +113,7 @@ class Guard:
 
     @contextmanager
     def call(self, context: fl.ServerCallContext, name: str) -> Generator[Call]:
-        """Run a call: raise its errors as those of Flight, and record it at the end."""
+        """Run a call: raise its errors as Flight errors, and record it at the end."""
         call, start_s, error = Call(name), time.monotonic(), ""
         key, peer = fingerprint_of(context), context.peer()
         with translate_errors():

@@ -24,7 +24,7 @@ _ROWS = 64
 
 
 class TriedMessage(Struct, frozen=True):
-    """A message, and what an adapter makes of it."""
+    """A message, and the rows or the rejection that an adapter derives from it."""
 
     index: int
     """Position in the topic, from 0."""

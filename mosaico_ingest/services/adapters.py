@@ -81,7 +81,7 @@ def _message_in(
 def topic_connections(
     recording: Recording, topic: str | None = None, *, msgtype: str | None = None
 ) -> list[Connection]:
-    """Return the connections of a topic, or those with a message type.
+    """Return the connections of a topic, or the connections with a message type.
 
     Raises:
         NothingMatched: There is none; the hint names the nearest.
@@ -325,8 +325,8 @@ def draft_adapter(
 ) -> str:
     """Return a draft of an adapter file for `folder`.
 
-    The type's definition is that of the recording `bag`, or of the first recording of the manifest `job`; `record` names a
-    topic whose first message is tested.
+    The recording `bag`, or the first recording of the manifest `job`, supplies the type's definition; `record` names a
+    topic, and the draft tests its first message.
 
     Raises:
         BagError: The definition is not known, or the recording cannot be read.

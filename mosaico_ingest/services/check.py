@@ -69,7 +69,7 @@ def check_sequence(
         SinkError: The store does not exist or has no such sequence.
     """
     from mosaico_ingest.contracts.stored import check_stored  # noqa: PLC0415 - only stored sequences need the store
-    from mosaico_ingest.destinations.store import Store  # noqa: PLC0415 - as above
+    from mosaico_ingest.destinations.store import Store  # noqa: PLC0415 - only stored sequences need the store
 
     contract = Contract.of(_contract_job(expect, env))
     if contract is None:

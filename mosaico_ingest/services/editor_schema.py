@@ -1,4 +1,4 @@
-"""JSON Schemas for editors: those of manifests and adapter files, with the known adapters and ontology tags as proposals."""
+"""JSON Schemas of manifests and adapter files for editors, with the known adapters and ontology tags as proposals."""
 
 from __future__ import annotations
 

@@ -56,7 +56,7 @@ class Arrivals:
         return tuple(path for path, files in sorted(states.items()) if self._has_settled(path, files, now))
 
     def complete(self) -> tuple[AnyPath, ...]:
-        """Return all recordings that are complete, including those of earlier calls of `settled`."""
+        """Return all complete recordings, including the results of earlier calls of `settled`."""
         return tuple(path for path, arrival in sorted(self._arrivals.items()) if arrival.settled)
 
     def unfinished(self) -> tuple[AnyPath, ...]:

@@ -33,7 +33,7 @@ def measured(contract: ContractResult | None) -> dict[str, tuple[str, Any]]:
 
 
 def both(folder: Path, settings: str) -> dict[str, tuple[str, Any]]:
-    """Return the results of a run, which must be those of a check."""
+    """Return the results of a run, and assert that a check has the same results."""
     record(
         folder / "drive.mcap",
         [

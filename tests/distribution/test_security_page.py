@@ -1,4 +1,4 @@
-"""The limits in SECURITY.md equal those of the code, and no limit of the code is missing."""
+"""The limits in SECURITY.md equal the limits of the code, and none is missing."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def test_documented_keys_exist() -> None:
         section, _, field = key.partition(".")
         assert section in {*JobSettings.model_fields, *Job.model_fields, "extends", "matrix"}
         if field:
-            assert field in JobSettings.model_fields[section].annotation.model_fields  # type: ignore[union-attr]
+            assert field in JobSettings.model_fields[section].annotation.model_fields  # type: ignore[union-attr] - sections are models
 
 
 def _constants(path: Path) -> set[str]:

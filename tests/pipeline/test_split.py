@@ -61,7 +61,7 @@ def every_second(path: Path, seconds: int = 10) -> Path:
 
 
 def write_job(path: Path, **keys: object) -> Path:
-    bag = {"path": path.name, **keys.pop("bag", {})}  # type: ignore[dict-item]
+    bag = {"path": path.name, **keys.pop("bag", {})}  # type: ignore[dict-item] - callers pass a dict
     manifest = {"version": 1, "bag": bag, "sequence": {"name": "s"}, "target": {"store": "store"}, **keys}
     job = path.parent / "job.yaml"
     job.write_text(json.dumps(manifest))

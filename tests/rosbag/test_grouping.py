@@ -6,6 +6,7 @@ import json
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
+from random import Random
 
 import pytest
 from hypothesis import given
@@ -71,10 +72,10 @@ def test_group_splits_pattern_groups_equal_fields() -> None:
     st.randoms(use_true_random=False),
 )
 def test_group_splits_keeps_every_file_once_and_orders_splits(
-    names: list[tuple[str, int]], random: object
+    names: list[tuple[str, int]], random: Random
 ) -> None:
     files = [Path(f"{stem}_{number}.mcap") for stem, number in names]
-    random.shuffle(files)  # type: ignore[attr-defined]
+    random.shuffle(files)
     groups = group_splits(files)
     assert sorted(file for group in groups for file in group.files) == sorted(files)
     for group in groups:

@@ -95,7 +95,7 @@ def test_audit_log_in_missing_folder_is_an_error(tmp_path: Path) -> None:
 def test_calls_above_the_rate_of_a_key_are_refused_and_others_accepted(tmp_path: Path) -> None:
     ring = Keyring(tmp_path / "keys.json")
     keys = [ring.add(Permission.READ), ring.add(Permission.READ)]
-    limits = Limits(requests_per_s=0.2)  # two calls at once, then one in five seconds
+    limits = Limits(requests_per_s=0.2)  # two calls immediately, then one in five seconds
     with (
         serve(tmp_path / "served", port=0, keys=ring, limits=limits) as running,
         Client(running, keys[0]) as first,

@@ -19,7 +19,7 @@ from rich.text import Text
 
 ESCAPE = re.compile(r"\x1b\[[0-9;?]*[A-Za-z]")
 CONTROL = re.compile(r"\x1b\[[0-9;?]*[A-Zac-ln-z]")
-"""Escape sequences that move the cursor or erase text; those that end with `m` set colors."""
+"""Escape sequences that move the cursor or erase text; sequences that end with `m` only set colors."""
 FONT_FACE = re.compile(r"@font-face \{.*?\}\s*", re.DOTALL)
 
 
@@ -29,7 +29,7 @@ def in_terminal(words: list[str], width: int, folder: Path) -> list[str]:
 
 
 def printed_lines(arguments: list[str], width: int, folder: Path) -> list[str]:
-    """Return the lines that Python prints to a terminal of this width, including those that it overwrites."""
+    """Return the lines that Python prints to a terminal of this width, including overwritten lines."""
     text = ESCAPE.sub("", captured(arguments, width, folder))
     return [line.rstrip() for line in text.splitlines()]
 

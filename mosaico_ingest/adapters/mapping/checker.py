@@ -100,9 +100,9 @@ class Scope(Struct, frozen=True):
     has_envelope: bool = False
     """Whether expressions can use the properties of messages besides their content."""
     subject: TypedExpression | None = None
-    """The elements in which names are looked up first, if the scope is that of an element."""
+    """The elements in which names are looked up first, in the scope of an element."""
     enclosing: Scope | None = None
-    """The scope in which names are looked up next, if the scope is that of an element."""
+    """The scope in which names are looked up next, in the scope of an element."""
 
     def nested(self, message: ExprType) -> Scope:
         """Return the scope of a nested message."""
@@ -368,7 +368,7 @@ class Checker:
         return tuple(_close_for(function.parameter(i), argument) for i, argument in enumerate(arguments))
 
     def _infer_with_elements(self, node: Call, function: Function) -> tuple[TypedExpression, ...] | None:
-        """Infer the arguments of a function some of whose parameters apply to each element of the first argument."""
+        """Infer the arguments of a function with parameters that apply to each element of the first argument."""
         first = self.infer(node.arguments[0])
         if first is None:
             return None

@@ -152,7 +152,7 @@ class AdapterTest(_Strict):
     given: Mapping[str, Any]
     """Fields of the message (all others are zero, empty or false), or `{bag, topic, index}`."""
     message: MessageProperties | None = None
-    """The properties of the message besides its content; those of a recorded message are its own."""
+    """The properties of the message besides its content; a recorded message has its own properties."""
     parameters: Mapping[str, Scalar] = Field(default_factory=dict)
     """Values of parameters; the others have their defaults."""
     expect: Expected | None = None
@@ -220,7 +220,7 @@ class MappingFile(_Strict):
     fields: Mapping[str, Value] | None = None
     """Column → value."""
     outputs: Annotated[Mapping[OutputName, Output], Field(min_length=1)] | None = None
-    """Instead of `ontology` and `fields`: name below the topic → what the messages become there."""
+    """Instead of `ontology` and `fields`: name below the topic → output with its own ontology type and fields."""
     schema_metadata: Mapping[str, Value] = Field(default_factory=dict)
     """Topic metadata, computed from the topic's first row."""
     definition: str | None = None
@@ -239,7 +239,7 @@ class MappingFile(_Strict):
 
 
 class RecordModel(Struct, frozen=True):
-    """What one output of an adapter file contains."""
+    """The content of one output of an adapter file."""
 
     path: tuple[str, ...]
     """The key path of the output; () if the file has no `outputs`."""
@@ -247,7 +247,7 @@ class RecordModel(Struct, frozen=True):
     fields: Mapping[str, Value]
     rows: str | None
     drop_when: str | None
-    """The condition of the output besides that of the file."""
+    """The condition of the output; the condition of the file applies, too."""
     schema_metadata: Mapping[str, Value]
 
 

@@ -412,10 +412,10 @@ def _headers(db: sqlite3.Connection, names: Collection[str]) -> tuple[SequenceIn
     rows = db.execute(f"SELECT * FROM sequences WHERE name {among}", (json.dumps(list(names)),)).fetchall()  # noqa: S608 - `among` is a constant
     ids = json.dumps([row["id"] for row in rows])
     sessions: dict[int, list[SessionInfo]] = defaultdict(list)
-    for row in db.execute(f"SELECT * FROM sessions WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - as above
+    for row in db.execute(f"SELECT * FROM sessions WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - `among` is a constant
         sessions[row["sequence_id"]].append(_session_info(row))
     notes: dict[int, list[Note]] = defaultdict(list)
-    for row in db.execute(f"SELECT * FROM notes WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - as above
+    for row in db.execute(f"SELECT * FROM notes WHERE sequence_id {among} ORDER BY id", (ids,)):  # noqa: S608 - `among` is a constant
         notes[row["sequence_id"]].append(_note_of(row))
     return tuple(
         SequenceInfo(

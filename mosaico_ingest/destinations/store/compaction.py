@@ -1,9 +1,9 @@
 """Compaction: merges small segments of a topic into larger ones, while other processes read and write the store.
 
 The rows of a topic keep their order, and its checksum stays the same. The merged file is written and read back before one
-transaction replaces the segments in the catalog. A process that is killed before it leaves a file that is in no catalog; one that
-is killed after it, or ends as planned, leaves the replaced files for readers that opened the sequence earlier. Garbage collection
-removes both.
+transaction replaces the segments in the catalog. If the process is killed before the
+transaction, the merged file remains and is in no catalog. After the transaction, the replaced files remain for readers that opened
+the sequence earlier. Garbage collection removes the files in both cases.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def compact(
     compression: Compression = Compression.FAST,
     max_bytes: int = MAX_BYTES,
 ) -> Iterator[Compacted]:
-    """Merge the small segments of each topic of a sequence, and yield what became one segment.
+    """Merge the small segments of each topic of a sequence, and yield the result for each group of segments.
 
     Segments that another process replaces or removes meanwhile, and segments with damage, stay as they are.
 
@@ -185,7 +185,7 @@ def _check(topic: TopicInfo, run: list[SegmentInfo], merged: SegmentInfo) -> Non
         problem = f"it has {merged.rows} rows, the segments have {sum(segment.rows for segment in run)}"
     if problem is not None:
         raise SinkError(
-            f"the merged file is not what was written: {problem}",
+            f"the merged file differs from the written rows: {problem}",
             where=str(merged.path),
             hint="check the disk; the segments are unchanged",
         )

@@ -376,7 +376,7 @@ def check_not_merged(session: str, sequence: str, segments: Iterable[tuple[Merge
         sessions = {part.session for part in merged}
         if session in sessions and len(sessions) > 1:
             raise SinkError(
-                f"compaction merged the rows of session {session} with those of others",
+                f"compaction merged the rows of session {session} with rows of other sessions",
                 where=sequence,
                 hint="replace or remove the sequence",
             )

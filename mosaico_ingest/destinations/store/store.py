@@ -421,7 +421,7 @@ class Store(Struct, frozen=True):
 
 
 def _attachment_paths(info: SequenceInfo | None, session: str | None = None) -> list[AnyPath]:
-    """Return the paths of a sequence's attachments, or of those that one session stored."""
+    """Return the paths of a sequence's attachments, or of the attachments that one session stored."""
     attachments = () if info is None else info.attachments
     return [each.path for each in attachments if session in {None, each.session}]
 
