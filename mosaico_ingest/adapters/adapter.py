@@ -110,6 +110,8 @@ class Envelope(Struct, frozen=True):
     """Publish times in ns since the epoch, shape (n,); None if they equal the log times."""
     sequences: NDArray[np.int64] | None = None
     """Sequence numbers, shape (n,); None if all are 0."""
+    indices: NDArray[np.int64] | None = None
+    """Positions of the messages among those of their topic, shape (n,); None if the batch starts with the topic."""
 
     def take(self, rows: NDArray[Any]) -> Envelope:
         """Return the envelope of some rows, given by a mask or by positions."""
@@ -119,6 +121,7 @@ class Envelope(Struct, frozen=True):
             self.log_times[rows],
             None if self.publish_times is None else self.publish_times[rows],
             None if self.sequences is None else self.sequences[rows],
+            None if self.indices is None else self.indices[rows],
         )
 
 

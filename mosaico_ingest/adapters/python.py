@@ -14,6 +14,7 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
+from mosaico_ingest.adapters.python_errors import error_text, location_of, rejection
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
@@ -226,7 +227,7 @@ class PythonAdapter(Struct, frozen=True):
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         """Adapt a batch with `from_batch` if the class has it, else message by message."""
         if hasattr(self.adapter, "from_batch"):
-            return self._by_columns(rows)
+            return self._by_columns(rows, envelope)
         return self._by_messages(rows, envelope)
 
     @property
@@ -256,17 +257,18 @@ class PythonAdapter(Struct, frozen=True):
         try:
             return dict(method(first_row.as_py()) or {})
         except Exception as error:
-            raise AdapterError(f"{self.adapter.__name__}.schema_metadata: {_one_line(error)}") from error
+            raise AdapterError(
+                f"{self.adapter.__name__}.schema_metadata: {error_text(error)}",
+                where=location_of(self.adapter, "schema_metadata", error) or None,
+            ) from error
 
-    def _by_columns(self, rows: pa.StructArray) -> Adapted:
-        results = list(self._columns(rows, first=0))
+    def _by_columns(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
+        results = list(self._columns(rows, envelope, first=0))
         failures = tuple(item for item in results if isinstance(item, RowFailure))
         parts = [item for item in results if not isinstance(item, RowFailure)]
         index = [start + np.flatnonzero(part.is_valid()).astype(np.int64) for start, part in parts]
         rejected = [
-            RowFailure(
-                int(row), "adapter-rejected", f"{self.adapter.__name__}.from_batch returned null for the row"
-            )
+            self._failure("from_batch returned null", rows, envelope, int(row))
             for start, part in parts
             for row in start + np.flatnonzero(part.is_null())
         ]
@@ -278,7 +280,7 @@ class PythonAdapter(Struct, frozen=True):
         )
 
     def _columns(
-        self, rows: pa.StructArray, *, first: int
+        self, rows: pa.StructArray, envelope: Envelope, *, first: int
     ) -> Iterator[RowFailure | tuple[int, pa.StructArray]]:
         """Yield adapted ranges and failed rows in order; a range that raises is halved until the row is found."""
         try:
@@ -286,10 +288,10 @@ class PythonAdapter(Struct, frozen=True):
         except Exception as error:  # noqa: BLE001 - user code may raise anything
             if len(rows) > 1:
                 half = len(rows) // 2
-                yield from self._columns(rows.slice(0, half), first=first)
-                yield from self._columns(rows.slice(half), first=first + half)
+                yield from self._columns(rows.slice(0, half), envelope, first=first)
+                yield from self._columns(rows.slice(half), envelope, first=first + half)
             else:
-                yield self._failure(first, error)
+                yield self._failure(error, rows, envelope, first)
             return
         yield first, self._checked(result, len(rows))
 
@@ -318,9 +320,9 @@ class PythonAdapter(Struct, frozen=True):
                 try:
                     part.add(row, *convert(ros_data, envelope, row))
                 except Exception as error:  # noqa: BLE001, PERF203 - user code may raise anything, for every row
-                    part.failures.append(self._failure(row, error))
+                    part.failures.append(self._failure(error, rows, envelope, row))
             parts.append(part)
-        arrays = [self._columns_of(part) for part in parts]
+        arrays = [self._columns_of(part, rows, envelope) for part in parts]
         index = np.array([row for part in parts for row in part.index], np.int64)
         times = np.array([time for part in parts for time in part.times], np.int64)
         changed = not np.array_equal(times, envelope.log_times[index])
@@ -355,7 +357,7 @@ class PythonAdapter(Struct, frozen=True):
         own: Any = value
         return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's models have no to_row
 
-    def _columns_of(self, part: _Rows) -> pa.StructArray:
+    def _columns_of(self, part: _Rows, messages: pa.StructArray, envelope: Envelope) -> pa.StructArray:
         """Convert rows to columns, and move rows that do not fit to the failures."""
         struct = self.ontology.struct
         try:
@@ -365,13 +367,18 @@ class PythonAdapter(Struct, frozen=True):
                 try:
                     _struct_array(part.rows[at : at + 1], struct)
                 except _MISFITS as error:  # noqa: PERF203 - runs only for batches that failed
-                    part.failures.append(self._failure(part.index[at], error))
+                    part.failures.append(self._failure(error, messages, envelope, part.index[at]))
                     part.drop(at)
             part.failures.sort(key=lambda failure: failure.row)
             return _struct_array(part.rows, struct)
 
-    def _failure(self, row: int, error: Exception) -> RowFailure:
-        return RowFailure(row, "adapter-rejected", f"{self.adapter.__name__}: {_one_line(error)}")
+    def _failure(
+        self, problem: Exception | str, messages: pa.StructArray, envelope: Envelope, row: int
+    ) -> RowFailure:
+        method = "from_batch" if hasattr(self.adapter, "from_batch") else "from_dict"
+        if method == "from_dict" and _overrides(self.adapter, "translate"):
+            method = "translate"
+        return rejection(self.adapter, method, problem, row=row, envelope=envelope, shape=messages.type)
 
 
 _MISFITS = (pa.ArrowException, OverflowError, TypeError, ValueError)
@@ -419,12 +426,6 @@ def _class_beside_base(adapter: type[Any], name: str, default: Callable[..., Any
     """Return a class of the module that defines the adapter's base class, which is the SDK's for its adapters."""
     base = next(base for base in adapter.__mro__ if base.__name__ == _BASE)
     return getattr(sys.modules[base.__module__], name, default)
-
-
-def _one_line(error: Exception) -> str:
-    """Return an exception in one line."""
-    text = " ".join(str(error).split())
-    return f"{type(error).__name__}: {text}" if text else type(error).__name__
 
 
 def _overrides(adapter: type[Any], method: str) -> bool:

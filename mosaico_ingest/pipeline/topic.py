@@ -260,9 +260,10 @@ class TopicPipeline:
 
     def _envelope(self, block: MessageBlock, index: NDArray[np.int64]) -> Envelope:
         """Return the envelope of some messages of a block."""
-        return Envelope(
+        envelope = Envelope(
             self.plan.topic, self.plan.msgtype, block.log_times, block.publish_times, block.sequences
         ).take(index)
+        return replace(envelope, indices=index + self.read)
 
     def _adapt(self, rows: pa.StructArray, envelope: Envelope, connection: int) -> Adapted:
         """Adapt messages; if the adapter itself fails, all of them fail."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import inspect
+import json
 import pickle
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,7 +14,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.adapters import python as base
-from mosaico_ingest.adapters.adapter import Adapted
+from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.bridge import adapter_spec, load_adapter_reference
 from mosaico_ingest.adapters.python import (
     PythonAdapter,
@@ -26,6 +28,7 @@ from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.header import Message
 from mosaico_ingest.ontology.model import Serializable
 from mosaico_ingest.rosbag.blocks import ROSMessage
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 
@@ -45,6 +48,12 @@ class SpeedAdapter(ROSAdapterBase[Speed]):
         if ros_data["data"] < 0:
             raise ValueError(f"speed is {ros_data['data']}")
         return Speed(value=ros_data["data"], **kwargs)
+
+
+def line_of(method: Callable[..., Any], text: str) -> int:
+    """Return the number of the first line of a method that contains a text."""
+    lines, first = inspect.getsourcelines(method)
+    return first + next(at for at, line in enumerate(lines) if text in line)
 
 
 @pytest.fixture
@@ -84,7 +93,41 @@ def test_python_adapter_exception_rejects_only_its_row(floats: Callable[..., Ada
     assert adapted.index.tolist() == [0, 2]
     (failure,) = adapted.failures
     assert (failure.row, failure.rule) == (1, "adapter-rejected")
-    assert failure.reason == "SpeedAdapter: ValueError: speed is -2.0"
+    line = line_of(SpeedAdapter.from_dict, "raise ValueError")
+    assert failure.reason == (
+        f"SpeedAdapter: ValueError: speed is -2.0 ({__file__}:{line}, message 1, log time 1 ns; fields: data)"
+    )
+
+
+def test_python_adapter_exception_in_library_names_line_of_adapter(floats: Callable[..., Adapted]) -> None:
+    class Parsing(SpeedAdapter):
+        @classmethod
+        def from_dict(cls, ros_data: dict[str, Any], **_: Any) -> Speed:
+            return Speed(value=json.loads(f"{{{ros_data}"))
+
+    (failure,) = floats(Parsing, 1).failures
+    assert (failure.rule, f"{__file__}:{line_of(Parsing.from_dict, 'json.loads')}," in failure.reason) == (
+        "adapter-rejected",
+        True,
+    )
+
+
+def test_python_adapter_rejection_has_index_and_log_time_in_topic_and_nested_fields(
+    define: Callable[..., Definition],
+) -> None:
+    class Failing(SpeedAdapter):
+        @classmethod
+        def from_dict(cls, ros_data: dict[str, Any], **_: Any) -> Speed:
+            return Speed(value=ros_data["pose"]["height"])
+
+    definition = define("geometry_msgs/msg/PoseArray")
+    shape = ros_shape(definition)
+    rows = pa.array([{"poses": []}], shape)
+    envelope = Envelope("/t", definition.root, np.array([7_000]), indices=np.array([41]))
+    (failure,) = PythonAdapterSpec(Failing).bind(definition, shape).adapt(rows, envelope).failures
+    assert "message 41, log time 7000 ns" in failure.reason
+    for name in ("header.stamp.sec", "header.frame_id", "poses[].position.x", "poses[].orientation.w"):
+        assert name in failure.reason
 
 
 @pytest.mark.promise("adapter-translate")
@@ -109,7 +152,9 @@ def test_python_adapter_wrong_class_rejects_row(floats: Callable[..., Adapted]) 
 
     adapted = floats(Wrong, 1, 0)
     assert adapted.index.tolist() == [1]
+    line = line_of(Wrong.from_dict, "@classmethod")
     assert "returned NoneType, expected Speed" in adapted.failures[0].reason
+    assert f"{__file__}:{line}, message 0, log time 0 ns; fields: data" in adapted.failures[0].reason
 
 
 def test_python_adapter_with_from_batch_receives_columns(floats: Callable[..., Adapted]) -> None:
@@ -130,7 +175,12 @@ def test_python_adapter_with_from_batch_receives_columns(floats: Callable[..., A
     assert ByColumns.calls == 1
     assert adapted.index.tolist() == [0, 2]
     assert adapted.rows.field("value").to_pylist() == [1, 3]
-    assert adapted.failures[0].row == 1
+    line = line_of(ByColumns.from_batch, "@classmethod")
+    (failure,) = adapted.failures
+    assert (failure.row, failure.rule) == (1, "adapter-rejected")
+    assert failure.reason == (
+        f"ByColumns: from_batch returned null ({__file__}:{line}, message 1, log time 1 ns; fields: data)"
+    )
 
 
 def test_from_batch_exception_rejects_only_bad_rows(floats: Callable[..., Adapted]) -> None:
@@ -143,9 +193,10 @@ def test_from_batch_exception_rejects_only_bad_rows(floats: Callable[..., Adapte
             return pa.array([{"value": value} for value in values], Speed.ontology_type().struct)
 
     adapted = floats(Picky, *range(20))
+    location = f"{__file__}:{line_of(Picky.from_batch, 'raise')}"
     assert adapted.index.tolist() == [*range(13), *range(14, 20)]
     assert [(failure.row, failure.reason) for failure in adapted.failures] == [
-        (13, "Picky: ValueError: thirteen")
+        (13, f"Picky: ValueError: thirteen ({location}, message 13, log time 13 ns; fields: data)")
     ]
 
 

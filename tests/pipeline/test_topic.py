@@ -47,11 +47,12 @@ class Positive:
     def topic_metadata(self, _row: object) -> dict[str, Any]:
         return {}
 
-    def adapt(self, rows: pa.StructArray, _envelope: Envelope) -> Adapted:
+    def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         values = rows.field(0).to_numpy(zero_copy_only=False)
         good = np.flatnonzero(values >= 0)
         failures = tuple(
-            RowFailure(int(row), "negative", f"{values[row]} < 0") for row in np.flatnonzero(values < 0)
+            RowFailure(int(row), "negative", f"{values[row]} < 0 in message {envelope.indices[row]}")
+            for row in np.flatnonzero(values < 0)
         )
         return Adapted(pa.array([{"data": value} for value in values[good]], SPEED.struct), good, failures)
 
