@@ -85,7 +85,7 @@ def test_replacing_run_on_full_disk_names_cause_and_keeps_old_sequence(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("left_bytes", [0, 4096, 40_000, 200_000])
+@pytest.mark.parametrize("left_bytes", [0, 4096, 40_000, 110_000, 200_000])
 def test_first_run_on_full_disk_publishes_nothing(
     left_bytes: int, write_bag: WriteBag, write_job: WriteJob, disk: Path, noise: list[bytes]
 ) -> None:

@@ -284,6 +284,7 @@ class Catalog:
         with closing(self._connect("rw" if create else "ro")) as db:
             if create:
                 _initialize(db, self.path)
+                _use_wal(db)
             version = _format(db, self.path)
             if create and version <= FORMAT:  # a catalog of a newer format must not be changed
                 version = _convert(db)
@@ -304,6 +305,7 @@ class Catalog:
         try:
             with closing(connect(draft, "mode=rwc")) as db:
                 _initialize(db, draft)
+                _use_wal(db)  # not earlier: on a full disk, the tables would stay in the log, which is not linked
             try:
                 os.link(draft, self.path)
             except FileExistsError:
@@ -333,7 +335,6 @@ def _initialize(db: sqlite3.Connection, path: Path) -> None:
     """Create the tables if the file is empty."""
     if _format(db, path) != 0:
         return
-    _use_wal(db)
     db.execute("BEGIN IMMEDIATE")
     if _format(db, path) == 0:  # another process may have been faster
         for statement in (_TABLES + schemas.TABLE).split(";"):
