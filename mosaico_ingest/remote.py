@@ -385,10 +385,10 @@ class RemotePath:
 
     def _web_version(self) -> str:
         handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - web URLs have a `PyFileSystem`, which has a handler
-        found = handler.properties(self.filesystem_path, cached=False)
-        if found is None:
+        properties = handler.properties(self.filesystem_path, cached=False)
+        if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
-        return f"{found.size} {found.version}"
+        return f"{properties.size} {properties.version}"
 
     def read_bytes(self) -> bytes:
         """Return the content of the object."""

@@ -131,7 +131,7 @@ _TABLE = (
     Rule("ING244", "metadata-schema", _ERROR, "metadata that violates its schema"),
     Rule("ING245", "invalid-schema", _ERROR, "a metadata schema that cannot be used"),
     Rule("ING246", "lock-file", _ERROR, "a lock file that does not exist or cannot be used"),
-    Rule("ING247", "python-refused", _ERROR, "an adapter in Python in a job that may run none"),
+    Rule("ING247", "python-refused", _ERROR, "an adapter in Python in a job that refuses Python"),
     Rule("ING250", "adapter-parameter", _ERROR, "a parameter that an adapter file does not have or accept"),
     Rule("ING260", "event-file", _ERROR, "an event file that cannot be used"),
     Rule("ING261", "event-interval", _ERROR, "an event whose end is not later than its start"),

@@ -101,14 +101,14 @@ class WebFiles(FileSystemHandler):
         try:
             response, where = self.request(path, 0, 1)
         except FileNotFoundError:
-            found = None
+            properties = None
         else:
             try:
-                found = _properties(response, where)
+                properties = _properties(response, where)
             finally:
                 _discard(response)
-        self._properties[path] = time.monotonic(), found
-        return found
+        self._properties[path] = time.monotonic(), properties
+        return properties
 
     def read(self, path: str, start: int, stop: int) -> bytes:
         """Return a range of a file; if the server ignores ranges, skip the bytes before it."""
@@ -141,11 +141,13 @@ class WebFiles(FileSystemHandler):
         """Return the properties of files."""
         infos: list[FileInfo] = []
         for path in [paths] if isinstance(paths, str) else paths:
-            found = self.properties(path)
-            if found is None:
+            properties = self.properties(path)
+            if properties is None:
                 infos.append(FileInfo(path, FileType.NotFound))
             else:
-                infos.append(FileInfo(path, FileType.File, size=found.size, mtime_ns=found.modified_ns))
+                infos.append(
+                    FileInfo(path, FileType.File, size=properties.size, mtime_ns=properties.modified_ns)
+                )
         return infos
 
     def get_file_info_selector(self, selector: Any) -> list[FileInfo]:  # noqa: ANN401, ARG002 - the signature of the base class
@@ -156,10 +158,10 @@ class WebFiles(FileSystemHandler):
 
     def open_input_file(self, path: str) -> pa.PythonFile:
         """Open a file for random access."""
-        found = self.properties(path, cached=False)
-        if found is None:
+        properties = self.properties(path, cached=False)
+        if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
-        return pa.PythonFile(_RangedFile(self, path, found), mode="r")
+        return pa.PythonFile(_RangedFile(self, path, properties), mode="r")
 
     def open_input_stream(self, path: str) -> pa.PythonFile:
         """Open a file for sequential reading."""
@@ -215,7 +217,9 @@ def _properties(response: Any, where: str) -> _Properties:  # noqa: ANN401 - a r
     else:
         total = headers.get("Content-Range", "").rpartition("/")[2]
     if not total.isdecimal():
-        raise IngestError("the server does not tell the size of the file", where=where, hint="download it")
+        raise IngestError(
+            "the server does not send the size of the file", where=where, hint="download the file"
+        )
     changed = headers.get("Last-Modified")
     try:
         modified_ns = None if changed is None else int(parsedate_to_datetime(changed).timestamp()) * 10**9

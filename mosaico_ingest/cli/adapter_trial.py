@@ -67,8 +67,8 @@ def _text(value: Any) -> str:  # noqa: ANN401 - a value of a message or row
     if isinstance(value, bytes):
         return f"{len(value)} bytes"
     if isinstance(value, list):
-        shown = ", ".join(_text(item) for item in value[:_MAX_ITEMS])
-        return f"[{shown}]" if len(value) <= _MAX_ITEMS else f"[{shown}, … {len(value)} elements]"
+        items = ", ".join(_text(item) for item in value[:_MAX_ITEMS])
+        return f"[{items}]" if len(value) <= _MAX_ITEMS else f"[{items}, … {len(value)} elements]"
     if isinstance(value, float):
         return f"{value:.6g}"
     text = "null" if value is None else str(value)

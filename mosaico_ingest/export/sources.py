@@ -106,11 +106,11 @@ class ServerSequence:
         """
         self._client = client
         self.name = name
-        found = client.find(name)
-        if found is None:
+        handler = client.find(name)
+        if handler is None:
             hint = suggest_names(client.sequence_names(), [name])
             raise SinkError(f"there is no sequence {name!r}", where=str(client.address), hint=hint)
-        self.metadata: Mapping[str, Any] = found.user_metadata or {}
+        self.metadata: Mapping[str, Any] = handler.user_metadata or {}
         self.attachments: tuple[AttachmentInfo, ...] = ()
         self._infos = {topic_name(info.resource_locator): info for info in client.topic_infos(name)}
         self.topics = tuple(self._topic(name, info) for name, info in sorted(self._infos.items()))

@@ -65,7 +65,7 @@ def decoded_buffer(data: bytes) -> bytes:
     """Return the raw buffer of an image file, without padding; 16-bit samples are little-endian.
 
     Raises:
-        ViewError: The bytes are no image file, or it is damaged.
+        ViewError: The bytes are not an image file, or the file is damaged.
         IngestError: Pillow is not installed.
     """
     samples = file_samples(data, keep_alpha=True)
@@ -97,7 +97,7 @@ def _jpeg_samples(samples: Samples, encoding: str) -> npt.NDArray[np.uint8]:
             f"{encoding} contains measurements, which JPEG would change; png, buffer_png and raw keep them"
         )
     if samples.values.dtype.kind != "u":
-        raise ViewError(f"{encoding} is no picture; raw and buffer_png keep it")
+        raise ViewError(f"{encoding} is not an encoding of pictures; raw and buffer_png keep it")
     pixels = eight_bits(samples.values)
     return np.ascontiguousarray(pixels[..., :_RGB]) if _has_colours(pixels) else pixels
 
@@ -108,7 +108,7 @@ def _png_samples(samples: Samples, encoding: str, depth_unit: float) -> npt.NDAr
         return _quantized(values, depth_unit)
     fits = values.dtype == np.uint8 or (values.dtype == np.uint16 and not _has_colours(values))
     if not fits or (samples.is_measured and _has_colours(values)):
-        raise ViewError(f"png has no samples of {encoding}; raw and buffer_png keep it")
+        raise ViewError(f"png cannot store samples of {encoding}; raw and buffer_png keep them")
     return values
 
 
@@ -120,7 +120,7 @@ def _quantized(depth: npt.NDArray[np.floating[Any]], unit: float) -> npt.NDArray
     if low < 0 or high > _MAX_DEPTH:
         value = (low if low < 0 else high) * unit
         raise ViewError(
-            f"a depth of {value:g} m is outside 0 to {_MAX_DEPTH * unit:g} m, which 16 bits hold in steps of {unit:g} m"
+            f"a depth of {value:g} m is outside 0 to {_MAX_DEPTH * unit:g} m, the range of 16 bits in steps of {unit:g} m"
         )
     return steps.astype(np.uint16)
 

@@ -30,7 +30,7 @@ three quarters of the default's time and makes photos 12 % smaller."""
 
 
 def image_file_type(data: bytes | memoryview) -> str | None:
-    """Return the type of an image file, such as `png`, or None if the bytes are no image file."""
+    """Return the type of an image file, such as `png`, or None if the bytes are not an image file."""
     start = bytes(data[:4])
     return next((name for signature, name in _SIGNATURES.items() if start.startswith(signature)), None)
 
@@ -41,7 +41,7 @@ def file_samples(data: bytes, *, keep_alpha: bool = False) -> npt.NDArray[Any]:
     With `keep_alpha`, a file with transparency has RGBA samples.
 
     Raises:
-        ViewError: The bytes are no image file, or it is damaged.
+        ViewError: The bytes are not an image file, or the file is damaged.
         IngestError: Pillow is not installed.
     """
     picture = _opened(data)
@@ -121,6 +121,4 @@ def _opened(data: bytes) -> Picture:
         return image.open(io.BytesIO(data))
     except (OSError, ValueError, SyntaxError, image.DecompressionBombError) as error:
         start = data[:8].hex(" ")
-        raise ViewError(
-            f"the bytes are no image file that Pillow can read; they start with {start}"
-        ) from error
+        raise ViewError(f"Pillow cannot read the bytes as an image file; they start with {start}") from error

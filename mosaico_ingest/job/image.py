@@ -37,8 +37,8 @@ class ImageSettings(Section):
     def _check_format(self) -> ImageSettings:
         for key, formats in _FORMATS.items():
             if key in self.model_fields_set and self.format not in formats:
-                needed = " or ".join(formats)
-                message = f"{key} requires format: {needed}, but format is {self.format}"
+                names = " or ".join(formats)
+                message = f"{key} requires format: {names}, but format is {self.format}"
                 raise PydanticCustomError("conflicting-keys", "{message}", {"key": key, "message": message})
         return self
 

@@ -27,7 +27,7 @@ _ROSBAG2_RECORD = "rosbag2"
 """The metadata record with a copy of `metadata.yaml`, whose content exports write again."""
 
 
-class Kept(Struct, frozen=True):
+class KeptContent(Struct, frozen=True):
     """The metadata and attachments that a plan keeps of a recording."""
 
     metadata: Mapping[str, Any]
@@ -36,7 +36,7 @@ class Kept(Struct, frozen=True):
     findings: tuple[Finding, ...]
 
 
-def kept_of(job: Job, recording: Recording) -> Kept:
+def kept_content(job: Job, recording: Recording) -> KeptContent:
     """Select the metadata and attachments that the sequence keeps, according to `sequence.keep`.
 
     Raises:
@@ -62,7 +62,7 @@ def kept_of(job: Job, recording: Recording) -> Kept:
         for attachment in (recording.attachments() if keep.attachments else ())
         if any(fnmatchcase(attachment.name, glob) for glob in keep.attachments)
     )
-    return Kept(metadata, attachments, tuple(_findings(job, attachments)))
+    return KeptContent(metadata, attachments, tuple(_findings(job, attachments)))
 
 
 def _findings(job: Job, attachments: tuple[Attachment, ...]) -> Iterator[Finding]:

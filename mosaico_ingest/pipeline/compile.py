@@ -129,10 +129,10 @@ def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ..
     where = loaded.where(*key_path)
     if not has_magic(without_options(pattern)):
         raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
-    found: list[AnyPath] = sorted(_glob(path), key=_order)
-    recordings = [match for match in found if _is_recording(match)]
+    matches: list[AnyPath] = sorted(_glob(path), key=_order)
+    recordings = [match for match in matches if _is_recording(match)]
     if not recordings:
-        only = f"; it matches {len(found)} other files" if found else ""
+        only = f"; it matches {len(matches)} other files" if matches else ""
         raise NothingMatched(f"no recording matches {path}{only}", where=where, hint=_nearby(path))
     return recordings
 
@@ -144,11 +144,11 @@ def _order(path: AnyPath) -> tuple[str, ...]:
 
 def _glob(path: AnyPath) -> Iterator[AnyPath]:
     """Yield the matches of a pattern; hidden files, such as those of copying programs, only if the pattern names them."""
-    found: Iterator[tuple[AnyPath, str]]
+    matches: Iterator[tuple[AnyPath, str]]
     if isinstance(path, RemotePath):
         above = next(parent for parent in path.above if not has_magic(parent.key))
         pattern = path.key.removeprefix(above.key)
-        found = ((match, match.key.removeprefix(above.key)) for match in above.glob(pattern))
+        matches = ((match, match.key.removeprefix(above.key)) for match in above.glob(pattern))
     else:
         fixed = next(parent for parent in path.parents if not has_magic(str(parent)))
         # Beside other characters `**` is `*`, as behind URLs; Python before 3.13 refuses it there.
@@ -157,8 +157,8 @@ def _glob(path: AnyPath) -> Iterator[AnyPath]:
         )
         pattern = "/".join(parts)
         depth = len(fixed.parts)
-        found = ((match, "/".join(match.parts[depth:])) for match in fixed.glob(pattern))
-    yield from (match for match, below in found if _is_hidden(pattern) or not _is_hidden(below))
+        matches = ((match, "/".join(match.parts[depth:])) for match in fixed.glob(pattern))
+    yield from (match for match, below in matches if _is_hidden(pattern) or not _is_hidden(below))
 
 
 def _is_hidden(path: str) -> bool:

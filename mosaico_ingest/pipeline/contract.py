@@ -43,8 +43,8 @@ class ContractRun(Struct, frozen=True):
         monitor = monitor_of(plan, recording)
         if monitor is None:
             return None
-        read = pipelines_by_connection(topics)
-        for connection, topic in read.items():
+        pipelines = pipelines_by_connection(topics)
+        for connection, topic in pipelines.items():
             observer = monitor.observer(connection)
             if observer is not None:
                 topic.observers[connection] = observer

@@ -20,7 +20,7 @@ from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
-from mosaico_ingest.pipeline.attachments import kept_of
+from mosaico_ingest.pipeline.attachments import kept_content
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
@@ -83,8 +83,8 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     findings += _image_settings(job, topics)
     findings += _missing_publish_times(job, recording, topics)
     findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
-    kept = kept_of(job, recording)
-    findings += kept.findings
+    content = kept_content(job, recording)
+    findings += content.findings
     plan = Plan(
         sequence=job.sequence.replace(family=job.family, metadata_from=None, metadata_schema=None),
         files=recording.files,
@@ -103,8 +103,8 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         read_from_ns=read_from_ns,
         read_until_ns=read_until_ns,
         part=job.part,
-        attachments=kept.attachments,
-        kept_metadata=kept.metadata,
+        attachments=content.attachments,
+        kept_metadata=content.metadata,
         missing=recording.missing_files,
         attempt=task.attempt,
         contract=contract,

@@ -162,7 +162,9 @@ def _event_parts(
             parts.append(_Part(part, event))
             continue
         hint = "correct its times, or remove it; the recording has no message between them"
-        message = f"{event.name!r} selects nothing of {recording.files[0].name}, so it becomes no sequence"
+        message = (
+            f"{event.name!r} selects no messages of {recording.files[0].name}, so it becomes no sequence"
+        )
         findings.append(Finding("event-outside", Severity.WARNING, message, event.span, hint))
     findings += overlaps(intervals)
     for position, planned in enumerate(parts):

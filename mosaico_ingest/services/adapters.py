@@ -84,7 +84,7 @@ def topic_connections(
     """Return the connections of a topic, or the connections with a message type.
 
     Raises:
-        NothingMatched: There is none; the hint names the nearest.
+        NothingMatched: No connection matches; the hint names the nearest topic or type.
     """
     connections = [
         one for one in recording.connections if topic in {None, one.topic} and msgtype in {None, one.msgtype}
@@ -348,7 +348,9 @@ def draft_adapter(
             )
             if definition.root != name:
                 raise AdapterError(
-                    f"it carries {definition.root}, not {name}", where=record, hint="name another topic"
+                    f"the topic has the type {definition.root}, not {name}",
+                    where=record,
+                    hint="name another topic",
                 )
     return draft(definition, ontology=ontology, embed=not _in_distros(definition), example=example)
 

@@ -66,7 +66,7 @@ def describe_ontology(tag: str) -> OntologyDescription:
     """Return an ontology type with all of its fields.
 
     Raises:
-        UnknownTag: There is none; the hint names the nearest.
+        UnknownTag: No type has the tag; the hint names the nearest tag.
     """
     ontology = ontology_type(tag)
     return OntologyDescription(

@@ -265,7 +265,7 @@ def test_init_unknown_type_lists_searched_sources(ingest: Ingest) -> None:
     assert "searched" in err
     code, _, err = ingest("init", "acme_msgs/BatteryPack", "--bag", BAG, "--record", "/imu")
     assert code == 1
-    assert "it carries sensor_msgs/msg/Imu" in err
+    assert "the topic has the type sensor_msgs/msg/Imu" in err
 
 
 @pytest.mark.parametrize(

@@ -406,12 +406,12 @@ def test_events_with_epoch_times_and_template_name(tmp_path: Path) -> None:
 def test_events_outside_and_overlapping_are_findings_of_the_plan(tmp_path: Path) -> None:
     job = events(tmp_path, "name,start,end\na,+1s,+4s\nb,+3s,+5s\nc,2020-01-01,2020-01-02\n")
     document = api.plan_job(job)
-    found = [
+    findings = [
         (note.rule, (note.location or "::").split(":")[1])
         for recording in document.recordings
         for note in recording.notes
     ]
-    assert [one for one in found if one[0].startswith("event-")] == [
+    assert [one for one in findings if one[0].startswith("event-")] == [
         ("event-outside", "4"),
         ("event-overlap", "3"),
     ]
@@ -440,8 +440,8 @@ def test_events_all_outside_fail_with_nothing_matched(tmp_path: Path) -> None:
     ],
 )
 def test_lint_event_file_reports_rule_and_line(tmp_path: Path, text: str, rule: str, line: int) -> None:
-    found = lint_paths([events(tmp_path, text)], env={}).findings
-    assert [(finding.rule, finding.span and finding.span.line) for finding in found] == [(rule, line)]
+    findings = lint_paths([events(tmp_path, text)], env={}).findings
+    assert [(finding.rule, finding.span and finding.span.line) for finding in findings] == [(rule, line)]
     if rule != "event-overlap":
         with pytest.raises(ManifestError) as refused:
             api.compile_job(tmp_path / "job.yaml")

@@ -46,8 +46,8 @@ class _Handler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         state = self.state
-        wanted = self.headers.get("Range", "")
-        state.requests.append((self.command, wanted))
+        byte_range = self.headers.get("Range", "")
+        state.requests.append((self.command, byte_range))
         time.sleep(state.delay_s)
         path, _, query = self.path[1:].partition("?")
         if state.failures:
@@ -57,12 +57,12 @@ class _Handler(BaseHTTPRequestHandler):
         elif path not in state.files:
             self.reply(404, b"")
         else:
-            self.send_content(state.files[path], wanted)
+            self.send_content(state.files[path], byte_range)
         if state.expires_after is not None:
             state.expires_after -= 1
 
-    def send_content(self, content: bytes, wanted: str) -> None:
-        match = re.fullmatch(r"bytes=(\d+)-(\d+)", wanted)
+    def send_content(self, content: bytes, byte_range: str) -> None:
+        match = re.fullmatch(r"bytes=(\d+)-(\d+)", byte_range)
         if match is None or not self.state.ranges:
             self.reply(200, content)
             return

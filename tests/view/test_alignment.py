@@ -101,8 +101,8 @@ def test_align_equals_search_row_by_row(
 @given(times=st.lists(INT64, min_size=1, max_size=6), at=st.lists(INT64, max_size=6))
 def test_align_times_of_the_full_range_find_the_nearest_row(times: list[int], at: list[int]) -> None:
     table = pa.table({"timestamp_ns": pa.array(sorted(times), pa.int64())})
-    found = align({"a": table}, at, method="nearest").column("a.timestamp_ns").to_pylist()
-    assert [abs(time - row) for time, row in zip(at, found, strict=True)] == [
+    times = align({"a": table}, at, method="nearest").column("a.timestamp_ns").to_pylist()
+    assert [abs(time - row) for time, row in zip(at, times, strict=True)] == [
         min(abs(time - own) for own in times) for time in at
     ]
 

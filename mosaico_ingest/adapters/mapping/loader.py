@@ -405,16 +405,16 @@ def _load(source: Source, adapters: AdapterLookup | None) -> tuple[MappingSpec |
 
 def _check_keys(model: MappingFile, analyzer: Analyzer) -> None:
     """Report keys that are missing or exclude each other, and names that cannot be bound."""
-    given = model.model_fields_set
+    keys = model.model_fields_set
     single = ("ontology", "fields", "rows", "schema_metadata")
     if model.outputs is None:
         for key in ("ontology", "fields"):
-            if key not in given:
+            if key not in keys:
                 message = f"the adapter needs the key {key!r}"
                 analyzer.report(("adapter",), message, f"add {key}:, or outputs:", rule="missing-key")
         return _check_names(model, analyzer)
     for key in single:
-        if key in given:
+        if key in keys:
             message = f"{key!r} and 'outputs' exclude each other"
             analyzer.report((key,), message, f"move {key} into each output", rule="conflicting-keys")
     for name, wrapper in (model.variants or {}).items():

@@ -674,8 +674,8 @@ def _replace_segments(db: sqlite3.Connection, change: Replacement) -> bool:
         (change.sequence, change.topic),
     ).fetchone()
     topic = None if row is None else int(row["id"])
-    known = set(_paths(db, "topic_id = ?", topic)) if topic is not None else set[str]()
-    if topic is None or not known.issuperset(change.replaced):
+    paths = set(_paths(db, "topic_id = ?", topic)) if topic is not None else set[str]()
+    if topic is None or not paths.issuperset(change.replaced):
         return False
     db.executemany("DELETE FROM segments WHERE path = ?", [(path,) for path in change.replaced])
     _enter_segments(db, topic, change.session, {change.path: change.segment})

@@ -187,8 +187,8 @@ class SequenceDocument(_Part):
         merged = _entry(change.session, change.path, change.segment).model_copy(
             update={"merged": tuple((part.session, part.checksum) for part in change.merged)}
         )
-        kept = tuple(one for one in held.segments if one.path not in change.replaced)
-        changed = held.model_copy(update={"segments": (*kept, merged)})
+        remaining = tuple(one for one in held.segments if one.path not in change.replaced)
+        changed = held.model_copy(update={"segments": (*remaining, merged)})
         topics = tuple(changed if topic is held else topic for topic in self.topics)
         return self.model_copy(update={"topics": topics})
 

@@ -402,8 +402,8 @@ class Store(Struct, frozen=True):
             live = {session for session in sessions if self.layout.in_use(session, grace_s)}
             paths = self.catalog.forget(live)
             if any(self.layout.relative(file).startswith(f"{ATTACHMENTS}/") for file in files):
-                kept = (path for info in self.catalog.sequences() for path in _attachment_paths(info))
-                paths |= {self.layout.relative(path) for path in kept}
+                attachments = (path for info in self.catalog.sequences() for path in _attachment_paths(info))
+                paths |= {self.layout.relative(path) for path in attachments}
             orphans = [file for file in files if self._is_orphan(file, paths, live)]
             dead = sorted(set(sessions) - live)
             staged = [file for session in dead for file in self.layout.staged_files(session)]

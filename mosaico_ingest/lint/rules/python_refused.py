@@ -1,4 +1,4 @@
-"""The check of `python-refused`: an adapter in Python in a job that may run none."""
+"""The check of `python-refused`: an adapter in Python in a job that refuses Python."""
 
 from __future__ import annotations
 

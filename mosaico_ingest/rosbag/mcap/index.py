@@ -173,7 +173,7 @@ def attachment_chunks(source: Source, attachment: Attachment) -> Iterator[bytes]
         yield chunk
     expected = int.from_bytes(source.read(end, 4), "little")
     if expected and crc != expected:
-        raise BagError(f"the checksum of the attachment {attachment.name!r} differs from that in the file")
+        raise BagError(f"the checksum of the attachment {attachment.name!r} differs from the one in the file")
 
 
 def _attachment(source: Source, start: int, end: int) -> Attachment:

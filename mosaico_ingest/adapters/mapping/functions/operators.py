@@ -381,9 +381,9 @@ def shifted(refuse: RejectRows, sign: str, x: Array, n: Array) -> Array:
     if sign == ">>":
         return pc.shift_right(x, n)
     result = pc.shift_left(x, n)
-    lost = true_mask(pc.not_equal(pc.shift_right(result, n), x))
-    if lost.any():
-        refuse(lost, "overflow", lambda i: f"{x[i]} << {n[i]} has more than 64 bits")
+    overflow = true_mask(pc.not_equal(pc.shift_right(result, n), x))
+    if overflow.any():
+        refuse(overflow, "overflow", lambda i: f"{x[i]} << {n[i]} has more than 64 bits")
     return result
 
 

@@ -94,9 +94,9 @@ def _local(axis: Axis) -> NDArray[np.int64]:
     return np.arange(axis.offsets[-1]) - axis.offsets[:-1][axis.parents]
 
 
-def _first(found: Mask, axis: Axis) -> NDArray[np.int64]:
-    """Return the position of the first element of each list that is found, or -1."""
-    positions = np.flatnonzero(found)
+def _first(matches: Mask, axis: Axis) -> NDArray[np.int64]:
+    """Return the position of the first match in each list, or -1."""
+    positions = np.flatnonzero(matches)
     rows, first = np.unique(axis.parents[positions], return_index=True)
     result = np.full(len(axis.lengths), -1, np.int64)
     result[rows] = positions[first]
@@ -160,10 +160,10 @@ def lookup(x: Array, key_field: Array, key: Array, value_field: Array) -> Array:
     """Value of the first element with a key, as in `lookup(values, key, 'voltage', value)`; null without such an element."""
     axis = open_list(x)[1]
     keys, elements = open_list(key_field)[0], open_list(value_field)[0]
-    found = true_mask(pc.equal(*comparable(keys, key.take(arrays.array(axis.parents)))))
+    matches = true_mask(pc.equal(*comparable(keys, key.take(arrays.array(axis.parents)))))
     if axis.null is not None:
-        found &= ~axis.null[axis.parents]
-    return _at_positions(elements, _first(found, axis))
+        matches &= ~axis.null[axis.parents]
+    return _at_positions(elements, _first(matches, axis))
 
 
 def _sortable(x: ExprType, keys: ExprType | None = None) -> ExprType:
@@ -256,10 +256,10 @@ def _position_of(x: Array, run: np.ufunc) -> Array:
     elements, axis = open_list(x)
     values = np.asarray(pc.fill_null(elements, 0))
     extreme = fold(values, axis, run, 0)[axis.parents]
-    found = values == extreme
+    matches = values == extreme
     if values.dtype.kind == "f":
-        found |= np.isnan(values)
-    first = _first(found, axis)
+        matches |= np.isnan(values)
+    first = _first(matches, axis)
     absent = absent_rows(elements, axis) | (first < 0)
     return arrays.array(np.where(absent, 0, first - axis.offsets[:-1]), arrays.int64(), mask=absent)
 
