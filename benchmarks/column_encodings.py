@@ -1,4 +1,4 @@
-"""Compare `target.compression: fast` and `small`, and the bytes that no compression saves.
+"""Compare `target.compression: fast` and `small`, and the lower bound of lossless compression.
 
     ./dev bench column_encodings RECORDING...
 
@@ -74,7 +74,7 @@ def ingest(recording: Path, folder: Path, compression: str) -> Sample:
 
 
 def entropy_bytes(path: Path) -> float:
-    """Return the smallest size of the columns of 64-bit floats whose values hardly repeat."""
+    """Return the smallest possible size of the columns of 64-bit floats with few repeated values."""
     return sum(_entropy_bytes(values) for column in pq.read_table(path).columns for values in _floats(column))
 
 

@@ -79,7 +79,7 @@ def is_transient(err: OSError) -> bool:
 
 
 class Network(Struct, frozen=True):
-    """How long to wait for a server, and how often to repeat a failed request."""
+    """Timeouts and attempts of requests, and the maximum size of a download."""
 
     attempts: int = 5
     """Maximum number of attempts per request, with a delay that doubles; GCS repeats for `request_s` seconds instead."""

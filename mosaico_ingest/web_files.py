@@ -1,6 +1,6 @@
 """Files behind `http://` and `https://` as a read-only file system of pyarrow, read by range.
 
-Requests are GET requests with a range, also those for sizes, because a presigned URL allows one method only. urllib3
+All requests, including requests for sizes, are GET requests with a range, because a presigned URL allows only one method. urllib3
 repeats failed requests. Errors never contain the query of a URL, because it may be secret.
 """
 
@@ -70,7 +70,7 @@ class WebFiles(FileSystemHandler):
         Raises:
             FileNotFoundError: The file does not exist.
             Unreachable: The server does not respond, or still fails after several attempts.
-            IngestError: Access is refused, or the server answers in another unexpected way.
+            IngestError: Access is refused, or the response is otherwise unexpected.
         """
         where = f"{self._root.partition('://')[0]}://{path}"
         url = f"{where}?{self._query}" if self._query else where

@@ -184,7 +184,7 @@ for words, code, is_plan in json.loads(sys.argv[1]):
     if exit_code != code:
         sys.exit(f"ingest {' '.join(words)}: exit code {exit_code}, expected {code}")
 """
-"""Runs commands in order, in one process: most of the time of a short command is the start of Python."""
+"""A program that runs commands in one process, because starting Python takes most of the time of a short command."""
 
 
 @pytest.fixture

@@ -1,4 +1,4 @@
-"""docs/recipes.md: lint accepts each manifest, plan finds no error, and the run stores the values that the answer promises."""
+"""docs/recipes.md: lint accepts each manifest, plan finds no error, and the run stores the documented values."""
 
 from __future__ import annotations
 
@@ -155,7 +155,7 @@ def random_pictures(messages: Messages) -> Messages:
 
 
 def write_counts(path: Path, vehicle: dict[str, str], *, damaged: int | None = None) -> None:
-    """Write five numbers, of which one can be too short."""
+    """Write five numbers, one of which can be truncated."""
     with path.open("wb") as file:
         writer = Writer(file)
         writer.start()
@@ -320,7 +320,7 @@ def test_page_answers_twenty_questions() -> None:
 
 
 @pytest.mark.parametrize("question", CHECKS)
-def test_recipe_lints_plans_and_stores_what_it_promises(files: Path, question: str) -> None:
+def test_recipe_lints_plans_and_stores_documented_values(files: Path, question: str) -> None:
     check, code = CHECKS[question]
     manifest = files / "recipe.yaml"
     manifest.write_text(recipes()[question][0])

@@ -23,7 +23,7 @@ MANIFEST = os.environ.get("INGEST_MANIFEST", "configs/integrations/nightly.yaml"
 RECORDINGS = os.environ.get("INGEST_RECORDINGS", "configs/quickstart")
 NOTHING_MATCHED, PARTLY_REJECTED = 3, 4
 FINAL = {2: "the manifest is wrong", 6: "the recording violates its contract"}
-"""Exit codes that a repetition does not change."""
+"""Exit codes of permanent failures; a retry returns the same code."""
 
 
 @dag(schedule="0 2 * * *", start_date=datetime(2026, 1, 1, tzinfo=timezone.utc), catchup=False)
@@ -37,7 +37,7 @@ def nightly_recordings() -> None:
 
     @task(retries=2, retry_delay=timedelta(minutes=1), map_index_template="{{ recording }}")
     def ingest(path: str) -> dict[str, Any]:
-        """Ingest one recording and return its totals; the task fails without retries if a repetition is useless."""
+        """Ingest one recording and return its totals; the task fails without retries after a permanent failure."""
         from airflow.sdk import get_current_context  # noqa: PLC0415 - exists in tasks only
 
         get_current_context()["recording"] = Path(path).name

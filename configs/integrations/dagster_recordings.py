@@ -38,7 +38,7 @@ def name_of(text: str) -> str:
 
 
 def recording_asset(job: Job) -> dg.AssetsDefinition:
-    """Return the asset of one recording: the sequence that it becomes, which a new materialization replaces."""
+    """Return the asset of one recording: its sequence, which a new materialization replaces."""
     checks = checks_of(job)
     replacing = job.replace(sequence=job.sequence.replace(if_exists=IfExists.REPLACE))
     name = name_of(job.sequence.name)
@@ -65,7 +65,7 @@ def recording_asset(job: Job) -> dg.AssetsDefinition:
 
 
 def expectations_below(path: str, contract: ContractResult, paths: Iterable[str]) -> list[ExpectationResult]:
-    """Return the results of the expectations whose longest key path among `paths` is `path`."""
+    """Return the results of the expectations for which `path` is the longest matching key path in `paths`."""
 
     def longest(result: ExpectationResult) -> str:
         return max((one for one in paths if result.expectation.startswith(f"{one}.")), key=len)

@@ -54,7 +54,7 @@ def adapter_spec(adapter: object, base_dir: Path, *, python: bool = True) -> Ada
     """Return the spec for a spec, an adapter class, or a reference as text or path.
 
     Raises:
-        AdapterError: The object is not an adapter, or is one in Python although `python` is false.
+        AdapterError: The object is not an adapter, or `python` is false and the adapter is written in Python.
     """
     if isinstance(adapter, (str, Path)):
         return load_adapter_reference(str(adapter), base_dir, python=python)
@@ -444,7 +444,7 @@ def _registered() -> dict[str, tuple[str, AdapterSpec]]:
 
 
 def installed_adapters() -> tuple[tuple[str, AdapterSpec], ...]:
-    """Return the adapters of installed packages, each with the name of its entry point; none if Python is refused.
+    """Return the adapters of installed packages, each with the name of its entry point; empty if Python is refused.
 
     Raises:
         AdapterError: An entry point cannot be imported or is not an adapter; the error names the package.

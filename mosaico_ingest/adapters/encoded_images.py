@@ -91,7 +91,7 @@ def _raw_images(rows: pa.StructArray) -> dict[int, RawImage]:
 def _encoded(
     images: dict[int, RawImage], settings: ImageSettings
 ) -> dict[int, EncodedImage | ViewError | None]:
-    """Return the file of each image, or the reason why there is none.
+    """Return the file of each image, or the reason for its rejection.
 
     The memory is bounded by the batch, its files, and one converted image per thread.
     """

@@ -182,7 +182,7 @@ def try_messages(
     msg_dirs: MsgDirOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show the first messages of a topic and the rows that an adapter makes of them, side by side.
+    """Show the first messages of a topic and the rows that an adapter derives from them, side by side.
 
     Exit codes: 0 no message is rejected, 4 a message is rejected.
     """

@@ -25,7 +25,7 @@ def compact(
     """Merge the small files of sequences that many sessions wrote. Readers and writers can continue meanwhile.
 
     The replaced files stay for programs that opened them earlier; `ingest store gc` removes them. Incomplete
-    sequences stay as they are.
+    sequences stay unchanged.
 
     Exit codes: 0 done, 5 a file is damaged.
     """

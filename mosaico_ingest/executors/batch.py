@@ -29,7 +29,7 @@ _MAX_SKIPPED = 256
 class Batch:
     """The recordings of a batch by position; every started recording gets exactly one report.
 
-    Recordings are taken from `source` one by one, so a batch may be of any size. Only recordings whose report has not been
+    Recordings are read from `source` one by one, so a batch may be of any size. Only recordings whose report has not been
     yielded are kept in memory.
     """
 
@@ -49,7 +49,7 @@ class Batch:
     _next: int = 0
 
     def take(self) -> int | None:
-        """Return the position of a recording to start, None if there is none now.
+        """Return the position of a recording to start, or None if no recording can start now.
 
         Recordings that are known to be stored are skipped here, so that no worker is needed for them.
         """

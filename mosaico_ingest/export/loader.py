@@ -91,7 +91,7 @@ class MosaicoToROSLoader:
         return None if restorer is None else restorer.definition.root
 
     def msg_count(self, topic: str | None = None) -> int:
-        """Return the number of messages of a topic, or of all, in the time range; reads the times of the rows.
+        """Return the number of messages of a topic, or of all topics, in the time range. Reads the times of the rows.
 
         Raises:
             NothingMatched: The topic has no messages to restore.

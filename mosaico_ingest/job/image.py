@@ -16,7 +16,7 @@ _FORMATS = {"quality": ("jpeg",), "max_width": ("png", "jpeg"), "depth_unit": ("
 
 
 class ImageSettings(Section):
-    """How raw images are stored. Images that are already compressed, and video, stay as they are."""
+    """The format of stored raw images. Compressed images and video keep their bytes."""
 
     format: ImageFormat = "raw"
     """The format: `raw` (as recorded), `png` (a lossless picture), `jpeg`, or `buffer_png` (the bytes of the image as a gray PNG,
@@ -24,7 +24,7 @@ class ImageSettings(Section):
     quality: Annotated[int, Field(ge=1, le=100)] = 90
     """The quality of JPEG files, from 1 to 100."""
     max_width: Count | None = Field(default=None, examples=[1280])
-    """The maximum width in pixels; wider images are scaled down, and keep their proportions."""
+    """The maximum width in pixels; wider images are scaled down and keep their proportions."""
     depth_unit: Annotated[float, Field(gt=0, le=1)] = 0.001
     """The step in meters at which `png` stores depth images of floating-point numbers in 16 bits."""
 

@@ -271,7 +271,7 @@ class TopicSettings(Section):
     image: Annotated[
         Annotated[ImageFormat, Tag("one")] | Annotated[ImageSettings, Tag("several")], Discriminator(shape_of)
     ] = Field(default="raw", examples=["png", {"format": "jpeg", "quality": 90, "max_width": 1280}])
-    """How raw images are stored: a format (`raw`, `png`, `jpeg`, `buffer_png`), or a format with its settings."""
+    """The format of stored raw images (`raw`, `png`, `jpeg`, `buffer_png`), or a mapping with the format and its settings."""
 
 
 def combined_settings(settings: Mapping[str, TopicSettings], topic: str) -> TopicSettings:
@@ -422,14 +422,14 @@ class NetworkSettings(Section):
     """Timeouts and retries of the requests for recordings and stores behind URLs."""
 
     attempts: Annotated[int, Field(ge=1, le=100)] = 5
-    """Maximum number of attempts per request, with a delay that doubles. Google Cloud Storage repeats for the time of `timeout`
-    instead; Azure uses the defaults of its client."""
+    """Maximum number of attempts per request; the delay between attempts doubles. Google Cloud Storage retries for the time of
+    `timeout` instead, and Azure uses the defaults of its client."""
     connect_timeout: Duration = Field(default=5 * 10**9, examples=["10 s"])
     """Maximum time to establish a connection."""
     timeout: Duration = Field(default=30 * 10**9, examples=["2 min"])
     """Maximum time between two parts of a response."""
     max_download: Bytes | None = Field(default=None, examples=["20GiB"])
-    """Maximum size of a recording that cannot be read by range and is therefore downloaded; larger ones are refused. Defaults
+    """Maximum size of a recording that cannot be read by range and is therefore downloaded; larger recordings are refused. Defaults
     to the free space of the temporary folder."""
 
     @property

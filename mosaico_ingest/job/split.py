@@ -1,4 +1,4 @@
-"""The section `split`: how one recording becomes several sequences, and the part that a job ingests."""
+"""The section `split`, which makes several sequences of one recording, and the part that a job ingests."""
 
 from __future__ import annotations
 
@@ -81,7 +81,7 @@ class SplitSettings(Section):
 
 
 def clean_name(text: str) -> str:
-    """Return a text with `_` in place of characters that `{event}` does not keep."""
+    """Return a text with `_` in place of characters that `{event}` cannot contain."""
     return _REFUSED.sub("_", text).strip("_")
 
 
@@ -97,9 +97,9 @@ class SequencePart(Struct, frozen=True):
     event: str | None = None
     """The name of the event, as written in the file."""
     read_from_ns: int | None = None
-    """No message of the part has an earlier log time; None if the log time is not known."""
+    """Start of the log times of the part's messages, inclusive; None if the log times are not known."""
     read_until_ns: int | None = None
-    """No message of the part has this log time or a later one."""
+    """End of the log times of the part's messages, exclusive; None if the log times are not known."""
     findings: tuple[Finding, ...] = ()
     """Findings about the split, which one of the parts reports."""
 

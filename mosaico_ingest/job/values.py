@@ -169,7 +169,7 @@ class Interval(Struct, frozen=True):
 
 
 class Compression(str, Enum):
-    """How much time compressing a stored sequence may take."""
+    """The trade-off between the size of a stored sequence and the time to compress it."""
 
     FAST = "fast"
     """Encodings by type and the lowest level of zstd."""

@@ -80,7 +80,7 @@ def _findings(job: Job, attachments: tuple[Attachment, ...]) -> Iterator[Finding
 
 
 def attach_files(plan: Plan, recording: Recording, session: Session, observe: Observer) -> None:
-    """Store the attachments of a plan; a damaged one is not stored, and reported as a finding.
+    """Store the attachments of a plan. A damaged attachment is not stored, but reported as a finding.
 
     Raises:
         SinkError: An attachment cannot be written.

@@ -44,7 +44,7 @@ def fingerprint(job: Job) -> str | None:
     """Return a digest of the state of the recording's files and of everything else that determines the stored rows.
 
     The state of a local file consists of path, size, inode, and the times of the last change of the content and of the
-    inode; the state of a remote one consists of URL and object version. If two fingerprints are equal, reading the
+    inode; the state of a remote file consists of URL and object version. If two fingerprints are equal, reading the
     recordings leads to the same content and the same decisions. The reverse does not hold.
 
     None if the result depends on other sources (earlier sequences, other recordings of the run, types that only Python

@@ -18,7 +18,7 @@ def is_static(topic: str) -> bool:
 def latched_blocks(
     plan: Plan, recording: Recording, times_of: Callable[[MessageBlock], Int64s]
 ) -> Iterator[MessageBlock]:
-    """Yield the messages before the time range to include: the latest one of each latched connection, all static ones.
+    """Yield the messages before the time range to include: the latest message of each latched connection, and all static messages.
 
     The messages of a connection are in log-time order. `times_of` returns the selected times of the messages of a block;
     a message is before the time range if its selected time is.

@@ -75,7 +75,7 @@ class TopicPipeline:
 
     A message that breaks a policy of `raise` or `finalize` ends the topic at this message: the rows before it are
     written, whatever the size of the blocks. If the adapter has several outputs, the pipeline of the first one processes
-    the messages, and `outputs` are the pipelines of the others; each message is written, dropped or rejected in all.
+    the messages, and `outputs` are the pipelines of the other outputs. Each message is written, dropped or rejected in all outputs.
     """
 
     plan: TopicPlan

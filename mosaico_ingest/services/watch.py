@@ -93,7 +93,7 @@ def is_unfinished(path: AnyPath) -> bool:
     """Return whether the end of a recording's file is missing: still being written, stalled, or truncated.
 
     MCAP files end with their magic bytes, ROS 1 bags have the offset of their index in their header, and SQLite databases
-    have their number of pages. Other files, compressed ones too, do not tell. Objects behind URLs appear when they are
+    have their number of pages. Other files, such as compressed ones, have no such mark. Objects behind URLs appear when they are
     complete.
     """
     if isinstance(path, RemotePath):

@@ -33,7 +33,7 @@ def align(
     """Return one row per time with the values of all topics at that time.
 
     The table has the column `timestamp_ns` and, for each topic, the columns `<name>.<column>` with structs flattened,
-    such as `imu.acceleration.x`. `<name>.timestamp_ns` is the time of the row that the values come from. All columns of a
+    such as `imu.acceleration.x`. `<name>.timestamp_ns` is the time of the row with these values. All columns of a
     topic are null at times without a row.
 
     Args:

@@ -101,7 +101,7 @@ def require_suffix(path: Path, suffixes: Sequence[str]) -> None:
     """Check that the name of a file has one of the suffixes, in upper or lower case.
 
     Raises:
-        ViewError: It has not.
+        ViewError: The name has another suffix.
     """
     if path.suffix.lower() not in suffixes:
         raise ViewError(

@@ -78,7 +78,7 @@ def test_batch_larger_than_threads_keeps_order_and_rejects_only_unsuitable_image
     assert [first_pixel(row["data"])[0] for row in result.rows.to_pylist()] == kept
 
 
-def test_images_that_are_encoded_already_stay_as_they_are(define: Define, adapt: Adapt) -> None:
+def test_encoded_images_stay_unchanged(define: Define, adapt: Adapt) -> None:
     png = EncodedImageSpec(BY_NAME["ImageAdapter"], ImageSettings(format="png"))
     definition = define("sensor_msgs/msg/Image")
     twice = EncodedImageSpec(png, ImageSettings(format="jpeg"))
@@ -169,7 +169,7 @@ def stored(recording: Path, topic: str) -> list[dict[str, Any]]:
     return Store.open(recording.parent / "store").topic("s", topic).to_arrow().to_pylist()
 
 
-def test_run_stores_pictures_accounts_for_rejected_images_and_passes_compressed_ones(cameras: Path) -> None:
+def test_run_stores_pictures_counts_rejected_images_and_keeps_compressed_images(cameras: Path) -> None:
     settings = {
         "/cam/color": {"image": {"format": "jpeg", "quality": 95, "max_width": 16}},
         "/cam/*": {"image": {"format": "png", "depth_unit": 0.01}},

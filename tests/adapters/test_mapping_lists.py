@@ -57,7 +57,7 @@ ROWS = st.lists(
     max_size=5,
 )
 REJECTED = "rejected"
-"""Stands for the value of a rejected row."""
+"""The value of a rejected row."""
 
 
 def ascending(values: list[Any]) -> list[Any]:

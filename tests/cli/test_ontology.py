@@ -22,7 +22,7 @@ def ingest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, st
     return int(leave.value.code or 0), out, err
 
 
-def test_ls_lists_every_tag_and_those_that_match(capsys: pytest.CaptureFixture[str]) -> None:
+def test_ls_lists_every_tag_or_tags_that_match_glob(capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = ingest(capsys, "ls", "--json")
     assert code == 0
     assert set(MODULES) <= {one["tag"] for one in json.loads(out)}

@@ -1,4 +1,4 @@
-"""Contracts of recordings of which a job selects a part: run and check observe the same messages."""
+"""Contracts of partly selected recordings: run and check observe the same messages."""
 
 from __future__ import annotations
 

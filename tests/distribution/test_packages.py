@@ -53,7 +53,7 @@ def test_packages_pass_the_checks_of_the_index(packages: tuple[Path, Path], tmp_
     run(sys.executable, "-m", "check_wheel_contents", packages[0], cwd=tmp_path)
 
 
-def test_packages_contain_what_the_program_reads_and_what_a_build_needs(packages: tuple[Path, Path]) -> None:
+def test_packages_contain_data_files_and_build_inputs(packages: tuple[Path, Path]) -> None:
     wheel, sdist = packages
     assert wheel.name == f"mosaico_ingest-{__version__}-py3-none-any.whl"
     with zipfile.ZipFile(wheel) as opened:
@@ -72,7 +72,7 @@ def test_packages_contain_what_the_program_reads_and_what_a_build_needs(packages
 
 
 def test_installed_wheel_runs_its_quickstart(packages: tuple[Path, Path], tmp_path: Path) -> None:
-    """Dependencies come from the environment of the tests, so that the test needs no network."""
+    """Check the quickstart; dependencies come from the environment of the tests, so that the test needs no network."""
     environment = tmp_path / "env"
     venv.create(environment, with_pip=False)
     python = environment / SCRIPTS / Path(sys.executable).name

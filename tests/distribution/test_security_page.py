@@ -44,7 +44,7 @@ INTERNAL = {
     "adapters.mapping.loader._MAX_CACHED_BINDINGS": "size of a cache",
     "rosbag.recording._MAX_READERS": "number of threads",
 }
-"""Constants that do not limit what input may cost, with the reason."""
+"""Constants that do not limit the cost of input, with the reason."""
 
 
 def documented() -> dict[str, tuple[str, str]]:

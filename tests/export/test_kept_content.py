@@ -1,4 +1,4 @@
-"""What sequences keep of their recordings besides messages: metadata records, custom_data and attachments."""
+"""Content of recordings, besides messages, that sequences keep: metadata records, custom_data and attachments."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
 
 CALIBRATION = bytes(range(256)) * 40_000
-"""Larger than one read."""
+"""Content that is larger than one read."""
 
 
 def write_mcap(path: Path, *, indexed: bool = True, plain: bytes = b"") -> Path:
@@ -184,7 +184,7 @@ def test_custom_data_round_trips_through_store(tmp_path: Path, suffix: str) -> N
         assert recording.custom_data() == {"driver": "Ada"}
 
 
-def test_export_to_bag_reports_what_the_file_cannot_contain(tmp_path: Path) -> None:
+def test_export_to_bag_reports_omitted_content(tmp_path: Path) -> None:
     original = tmp_path / "drive.mcap"
     with original.open("wb") as file:
         writer = Writer(file)

@@ -372,7 +372,7 @@ def test_loader_of_a_server_yields_the_messages_of_the_recording(server: Server)
     assert loader.resolve_native_msg_type("/imu") == "sensor_msgs/msg/Imu"
 
 
-def test_loader_of_a_store_applies_the_time_range_and_names_topics_it_cannot_restore(
+def test_loader_of_a_store_applies_the_time_range_and_names_rejected_topics(
     server: Server, tmp_path: Path
 ) -> None:
     ingest(server.port, DRIVE, topics=["/imu", "/battery"])

@@ -1,4 +1,4 @@
-"""The action for GitHub and the template for GitLab: their scripts run with bash, and fail when they have to."""
+"""The action for GitHub and the template for GitLab: their scripts run with bash, and fail when a check fails."""
 
 from __future__ import annotations
 

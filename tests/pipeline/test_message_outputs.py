@@ -216,7 +216,7 @@ def test_export_of_several_rows_or_topics_is_refused(tmp_path: Path, adapter: st
     assert "has no inverse" in reasons[topic]
 
 
-def test_properties_of_messages_are_those_of_the_recording(tmp_path: Path) -> None:
+def test_message_properties_equal_recording(tmp_path: Path) -> None:
     with (tmp_path / "batches.mcap").open("wb") as file:
         writer = OfficialWriter(file)
         writer.start("ros2", "test")

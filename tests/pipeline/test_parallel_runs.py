@@ -68,7 +68,7 @@ def delay(monkeypatch: pytest.MonkeyPatch, owner: type, name: str) -> None:
 
 
 def limit_memory(monkeypatch: pytest.MonkeyPatch, size: int) -> None:
-    """Let the reader and the sink hold `size` bytes each, which determines the sizes of batches and row groups."""
+    """Limit the reader and the sink to `size` bytes each, which determines the sizes of batches and row groups."""
     monkeypatch.setattr(MemoryBudget, "read_bytes", size)
     monkeypatch.setattr(MemoryBudget, "sink_bytes", size)
 
@@ -84,7 +84,7 @@ def payload(topic: str, number: int) -> bytes:
 
 
 Message = tuple[str, int, bool]
-"""The topic, the time step, and whether the message is cut off."""
+"""The topic, the time step, and whether the message is truncated."""
 
 
 def write_recording(path: Path, messages: Sequence[Message]) -> Path:

@@ -101,7 +101,7 @@ BOUND = st.none() | st.integers(0, 6 * SECOND)
 
 
 class Oracle:
-    """Splits a recording message by message."""
+    """A slow oracle that splits a recording message by message."""
 
     def __init__(
         self, messages: Messages, *, stamp: str, offset_ns: int, rate: float | None, every: int
@@ -251,7 +251,7 @@ def test_split_conditions_apply_to_each_part_and_empty_parts_are_skipped(tmp_pat
     assert report.exit_code == 0
 
 
-def test_split_repeated_run_skips_parts_and_completes_missing_ones(tmp_path: Path) -> None:
+def test_split_repeated_run_skips_parts_and_completes_missing_parts(tmp_path: Path) -> None:
     path = every_second(tmp_path / "r.mcap")
     keys: dict[str, Any] = {"split": {"by": "5 s"}, "sequence": {"name": "s", "if_exists": "skip"}}
     _, store = run(path, **keys)

@@ -249,7 +249,7 @@ def test_status_after_any_changes_equals_that_of_opening_every_recording(
 
 
 @pytest.mark.parametrize("change", ["nothing", "touch", "replace by other", "adapter", "error noted"])
-def test_run_after_change_skips_what_a_run_with_verify_skips(
+def test_run_after_change_skips_same_recordings_as_with_verify(
     fleet: Path, tmp_path: Path, change: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fingerprint, "_SETTLED_NS", 0)

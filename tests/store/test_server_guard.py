@@ -28,7 +28,7 @@ def entries(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
 
-def test_audit_log_records_who_read_and_wrote_what(tmp_path: Path, rows: Rows) -> None:
+def test_audit_log_records_key_call_target_and_status(tmp_path: Path, rows: Rows) -> None:
     ring = Keyring(tmp_path / "keys.json")
     key, other = ring.add(Permission.WRITE), ring.add(Permission.READ)
     log = tmp_path / "audit.jsonl"

@@ -45,7 +45,7 @@ def source(path: str) -> Path:
 
 
 def page_list() -> str:
-    """Return a table for each section of the navigation, with the sentence that states what each page teaches."""
+    """Return a table for each section of the navigation, with the opening sentence of each page."""
     lines: list[str] = []
     for section, pages in navigation().items():
         lines += [
@@ -63,7 +63,7 @@ def page_list() -> str:
 
 
 def ability(page: Path) -> str:
-    """Return the rest of the sentence with which a page opens."""
+    """Return the rest of the opening sentence of a page."""
     match = ABILITY.search(page.read_text(encoding="utf-8"))
     if match is None:
         raise ValueError(f"{page} does not open with `After reading this page, you …`")
@@ -120,7 +120,7 @@ def linked_file(page: Path, link: str) -> Path:
 
 
 def with_site_links(page: Path, text: str) -> str:
-    """Return a page with the links and the code that it has on the site."""
+    """Return a page with its links and code adapted to the site."""
     here = site_path(page).parent
 
     def replaced(match: re.Match[str]) -> str:
@@ -135,7 +135,7 @@ def with_site_links(page: Path, text: str) -> str:
 
 
 def _site_code(code: str) -> str:
-    """Return code with plain `|`, which GitHub needs escaped in tables and the site must not escape."""
+    """Return code with plain `|`: tables on GitHub require it escaped, and the site requires it unescaped."""
     return code if code.startswith("```") else code.replace("\\|", "|")
 
 

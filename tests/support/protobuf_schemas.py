@@ -119,7 +119,7 @@ def proto2_file(*, group: bool = False) -> FileDescriptorProto:
 
 
 def editions_file(*, delimited: bool = False) -> FileDescriptorProto:
-    """Return a file of edition 2023 whose message `all.New` sets the features that change how bytes are read."""
+    """Return a file of edition 2023; its message `all.New` sets the features that affect decoding."""
     file = FileDescriptorProto(name="new.proto", package="all", syntax="editions", edition="EDITION_2023")
     for name, kind in (("Open", FeatureSet.OPEN), ("Closed", FeatureSet.CLOSED)):
         enum = file.enum_type.add(name=name)

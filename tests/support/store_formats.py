@@ -8,7 +8,7 @@ from pathlib import Path
 
 
 def make_format_1(root: Path) -> None:
-    """Convert the catalog of the store to the first one of format 1.
+    """Convert the catalog of the store to its first version of format 1.
 
     Each topic has its own schema, and segments have neither checksums nor merged sessions.
     """

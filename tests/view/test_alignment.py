@@ -45,7 +45,7 @@ def table_of(rows: Sequence[Row]) -> pa.Table:
 
 
 def row_at(rows: Sequence[Row], time: int, method: str, limit: int) -> Row | None:
-    """Return the last row at or before a time, or the nearest one with the earlier one first."""
+    """Return the last row at or before a time, or the nearest row, preferring the earlier of two."""
     before = [row for row in rows if row[0] <= time][-1:]
     after = [row for row in rows if row[0] > time][:1] if method == "nearest" else []
     near = [row for row in (*before, *after) if abs(row[0] - time) <= limit]

@@ -2,8 +2,8 @@
 
 The rows of a topic keep their order, and its checksum stays the same. The merged file is written and read back before one
 transaction replaces the segments in the catalog. If the process is killed before the
-transaction, the merged file remains and is in no catalog. After the transaction, the replaced files remain for readers that opened
-the sequence earlier. Garbage collection removes the files in both cases.
+transaction, the merged file remains and is in no catalog. After the transaction, the replaced files remain for readers that
+opened the sequence earlier. Garbage collection removes the files in both cases.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ def compact(
 ) -> Iterator[Compacted]:
     """Merge the small segments of each topic of a sequence, and yield the result for each group of segments.
 
-    Segments that another process replaces or removes meanwhile, and segments with damage, stay as they are.
+    Segments that another process replaces or removes meanwhile, and damaged segments, stay unchanged.
 
     Raises:
         SinkError: The store cannot be written.

@@ -367,10 +367,10 @@ class NewNote(Struct, frozen=True):
 
 
 def check_not_merged(session: str, sequence: str, segments: Iterable[tuple[MergedSegment, ...]]) -> None:
-    """Check that no merged segment contains rows of a session and of others.
+    """Check that no merged segment contains rows of this session and of other sessions.
 
     Raises:
-        SinkError: One does, so the session cannot be removed.
+        SinkError: A segment does, so the session cannot be removed.
     """
     for merged in segments:
         sessions = {part.session for part in merged}
