@@ -154,6 +154,7 @@ _TABLE = (
     Rule("ING411", "adapter-file", _ERROR, "an adapter file that is inconsistent"),
     Rule("ING412", "adapter-cycle", _ERROR, "adapters that use each other in a cycle"),
     Rule("ING413", "unchecked-adapter", _INFO, "an adapter for a message type whose definition is unknown"),
+    Rule("ING414", "ambiguous-text", _ERROR, "an unquoted word in a `map` to text"),
     Rule("ING501", "unreadable-range", _WARNING, "a part of a recording that cannot be read"),
     Rule("ING502", "recovered-range", _INFO, "damage in a recording that lost no message"),
     Rule("ING503", "missing-split", _WARNING, "a split that `metadata.yaml` lists and that does not exist"),

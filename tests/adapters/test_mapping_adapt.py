@@ -260,7 +260,9 @@ def test_adapt_map_replaces_values_and_constants() -> None:
     assert [
         r["a"]
         for r in values(
-            "a: string", "a: {value: status, map: {0: idle, CHARGING: busy}, else: \"'?'\"}", *messages
+            "a: string",
+            "a: {value: status, map: {0: \"'idle'\", CHARGING: \"'busy'\"}, else: \"'?'\"}",
+            *messages,
         )
     ] == ["idle", "busy", "?"]
     assert [r["a"] for r in values("a: uint8", "a: {value: status, map: {0: 9}, else: keep}", *messages)] == [
@@ -278,6 +280,25 @@ def test_adapt_map_replaces_values_and_constants() -> None:
         "a: {value: 'cells[].voltage_mv', map: {1: 2}, else: 0}",
         {"cells": [{"voltage_mv": 1}, {}]},
     ) == [{"a": [2, 0]}]
+
+
+@pytest.mark.parametrize("types", ["string", "uint8", "float32"])
+@pytest.mark.parametrize("text", ["\"'a'\"", "CHARGING", "(CHARGING)", "7", "null", "true", "1.5", "'\"'"])
+def test_adapt_map_and_else_give_text_the_same_meaning(types: str, text: str) -> None:
+    def outcome(field: str, message: dict[str, Any]) -> object:
+        try:
+            return values(f"a: {types}", f"a: {field}", message)
+        except AdapterError:
+            return "no value"
+
+    in_map = outcome(f"{{value: status, map: {{1: {text}}}}}", {"status": 1})
+    in_else = outcome(f"{{value: status, map: {{5: null}}, else: {text}}}", {"status": 1})
+    assert in_map == in_else
+
+
+@pytest.mark.parametrize(("text", "expected"), [("CHARGING", 1), ("(CHARGING)", 1), ("9", 9), ("null", None)])
+def test_adapt_map_value_can_be_a_constant(text: str, expected: int | None) -> None:
+    assert values("a: uint8", f"a: {{value: status, map: {{3: {text}}}}}", {"status": 3}) == [{"a": expected}]
 
 
 def test_adapt_with_and_when_change_struct() -> None:

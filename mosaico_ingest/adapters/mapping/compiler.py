@@ -401,23 +401,22 @@ class Compiler:
     ) -> MapLookup | None:
         analyzer = self._analyzer
         operand = _typed(analyzer.scalar((*target.path, "value"), form.value, target.scope))
-        default = None
-        if form.otherwise not in {"error", "keep"}:
-            analyzed = analyzer.scalar((*target.path, "else"), form.otherwise, target.scope)
-            if analyzed is None:
-                return None
-            default = _typed(analyzed)
         if operand is None or target.scope is None:
             return None
         element = analyzer.element_type((*target.path, "value"), operand.type, target.type)
         if element is None:
             return None
-        table = self._map_entries(entries, operand, replace(target.at("map"), type=element))
-        path = (*target.path, "else")
+        inner = replace(target, type=element)
+        table = self._map_entries(entries, operand, inner.at("map"))
+        default = None
         if form.otherwise == "keep":
-            default, path = operand, (*target.path, "value")
-        if default is not None and not analyzer.check_fits(path, default.type.element, element):
-            return None
+            default = operand
+            if not analyzer.check_fits((*target.path, "value"), operand.type.element, element):
+                return None
+        elif form.otherwise != "error":
+            default = self._replacement(form.otherwise, inner.at("else"))
+            if default is None:
+                return None
         if table is None:
             return None
         keys, values = table
@@ -436,11 +435,37 @@ class Compiler:
             )
             return None
         keys = [self._map_key(key, operand, target) for key in entries]
-        fits = [
-            self._literal_fits(typed_constant(value, str(value)), replace(target, path=(*target.path, key)))
-            for key, value in entries.items()
+        values = [
+            self._constant(value, replace(target, path=(*target.path, key))) for key, value in entries.items()
         ]
-        return (keys, list(entries.values())) if all(fits) and None not in keys else None
+        constants = [value.value for value in values if value is not None]
+        return (keys, constants) if len(constants) == len(keys) and None not in keys else None
+
+    def _constant(self, value: Scalar, target: Target) -> Constant | None:
+        """Return a value of a map, which is the same for every row; None after a finding."""
+        bare = isinstance(value, str) and value.strip().isidentifier()
+        if bare and pt.is_string(target.type):
+            message = f"{value} is a name here, not text"
+            hint = f"write \"'{value}'\" for the text, or ({value}) for a constant"
+            self._analyzer.report_value(target.path, message, hint, rule="ambiguous-text")
+            return None
+        typed = self._replacement(value, target)
+        if typed is None or isinstance(typed, Constant):
+            return typed
+        message = f"`{typed.text}` is not a constant"
+        hint = "write a literal, a constant of the message type or a parameter"
+        self._analyzer.report_value(target.path, message, hint, rule="operand-type")
+        return None
+
+    def _replacement(self, value: Scalar, target: Target) -> TypedExpression | None:
+        """Return a value of `map` or `else`: text is an expression, anything else a literal; None after a finding."""
+        analyzed = self._analyzer.scalar(target.path, value, target.scope)
+        if isinstance(analyzed, Constant):
+            return analyzed if self._literal_fits(analyzed, target) else None
+        if analyzed is None or analyzed.typed is None:
+            return None
+        fits = self._analyzer.check_fits(target.path, analyzed.typed.type.element, target.type)
+        return analyzed.typed if fits else None
 
     def _map_key(self, key: Scalar, operand: TypedExpression, target: Target) -> Scalar:
         """Return the value of a key, which may name a constant of the message; None after a finding."""

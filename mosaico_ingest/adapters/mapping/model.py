@@ -58,7 +58,8 @@ class ValueForm(_Strict):
     value: Scalar = None
     """An expression."""
     map: Annotated[Mapping[Scalar, Scalar], Field(min_length=1)] | None = None
-    """Replacements for `value`: keys are values, or names of constants of the message."""
+    """Replacements for `value`: keys are values, or names of constants of the message. Text in a replacement is an
+    expression that is the same for every row, such as a constant or `'idle'`."""
     otherwise: Annotated[
         Scalar, Field(alias="else", default="error", examples=["error", "keep", "'unknown'"])
     ]
