@@ -293,7 +293,31 @@ def test_bit_operator_equals_python(text: str, pairs: list[tuple[int | None, int
     assert column(text, left, pa.int64(), right) == expected
 
 
-@pytest.mark.parametrize("text", ["x << 1", "x << 64", "x >> -1", "bit(x, 64)"])
+@pytest.mark.parametrize(
+    ("text", "value", "expected"),
+    [("x >> 63", -5, -1), ("x >> 63", 2**62, 0), ("bit(x, 63)", -1, True), ("x << 63", -1, -(2**63))],
+)
+def test_shift_by_63_bits_equals_python(text: str, value: int, expected: int) -> None:
+    assert column(text, [value], pa.int64()) == [expected]
+
+
+def test_literals_of_equal_value_and_other_type_stay_apart() -> None:
+    assert column("[cast(true, 'int8'), sign(1), x]", [5], pa.int64()) == [[1, 1, 5]]
+    assert column("[1 / -0.0, 1 / 0.0, x]", [5.0], pa.float64()) == [[-math.inf, math.inf, 5.0]]
+
+
+@pytest.mark.parametrize(
+    "text", ["sort(x.a, x.b[])", "filter(x.a, x.b[] > 0)", "lookup(x.a, self, 1, x.b[])"]
+)
+def test_elements_with_other_number_of_values_reject_row(text: str) -> None:
+    kind = pa.struct({"a": pa.list_(pa.int64()), "b": pa.list_(pa.int64())})
+    assert column(text, [{"a": [1, 2], "b": [4, 3]}], kind)
+    with pytest.raises(RowsRejected) as caught:
+        column(text, [{"a": [1, 2], "b": [4, 3]}, {"a": [1, 2], "b": [5]}], kind)
+    assert {row: rule for row, (rule, _) in caught.value.rejections.items()} == {1: "list-length"}
+
+
+@pytest.mark.parametrize("text", ["x << 1", "x << 64", "x << 63", "x >> -1", "bit(x, 64)"])
 def test_shift_out_of_range_rejects_row(text: str) -> None:
     with pytest.raises(RowsRejected) as caught:
         column(text, [2**62], pa.int64())

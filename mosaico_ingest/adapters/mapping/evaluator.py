@@ -42,7 +42,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
     OuterValue,
     TypedExpression,
 )
-from mosaico_ingest.adapters.mapping.functions.registry import RejectRows
+from mosaico_ingest.adapters.mapping.functions.registry import Function, RejectRows
 
 Rejection: TypeAlias = tuple[str, str]
 """The rule that a row violates, and the reason."""
@@ -276,10 +276,24 @@ class Evaluation:
             if isinstance(value, pa.Scalar) and (not function.scalars or (all_literals and position == 0)):
                 value = repeat(value, 1 if all_literals else count)
             arguments.append(value if parameter.prepare is None else parameter.prepare(value))
+        self._check_elements(function, arguments, axes, typed.text)
         if function.refuses:
             arguments.insert(0, self.rejecter(axes, typed.text))
         result = function.apply(*arguments)
         return Column(result[0]) if all_literals else Column(result, axes)
+
+    def _check_elements(
+        self, function: Function, arguments: list[Array], axes: tuple[Axis, ...], text: str
+    ) -> None:
+        """Reject rows in which an argument about the elements of the first one has another number of them."""
+        positions = [i for i in range(1, len(arguments)) if function.parameter(i).of_elements]
+        if not positions:
+            return
+        elements = open_list(arguments[0])[1]
+        for position in positions:
+            axis = open_list(arguments[position])[1]
+            if not axis.matches(elements):
+                self._reject_lengths((*axes, axis), (*axes, elements), text)
 
     def _list(self, typed: MakeList) -> Column:
         if not typed.items:

@@ -22,6 +22,9 @@ class Constant(ExpressionNode, frozen=True, eq=False):
     type: ExprType
     text: str = ""
 
+    def _content(self) -> tuple[object, ...]:
+        return (repr(self.value), self.type.arrow)  # because True == 1 == 1.0, and 0.0 == -0.0
+
 
 class MessageRef(ExpressionNode, frozen=True, eq=False):
     """The message in which names are looked up."""

@@ -56,6 +56,9 @@ class Literal(ExpressionNode, frozen=True, eq=False):
     value: LiteralValue
     span: TextRange
 
+    def _content(self) -> tuple[object, ...]:
+        return (repr(self.value),)  # because True == 1 == 1.0, and 0.0 == -0.0
+
 
 class Name(ExpressionNode, frozen=True, eq=False):
     """The name of a field or constant of the message."""

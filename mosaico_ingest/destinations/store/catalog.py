@@ -305,7 +305,9 @@ class Catalog:
         try:
             with closing(connect(draft, "mode=rwc")) as db:
                 _initialize(db, draft)
-                _use_wal(db)  # not earlier: on a full disk, the tables would stay in the log, which is not linked
+                _use_wal(
+                    db
+                )  # not earlier: on a full disk, the tables would stay in the log, which is not linked
             try:
                 os.link(draft, self.path)
             except FileExistsError:

@@ -379,12 +379,18 @@ def shifted(refuse: RejectRows, sign: str, x: Array, n: Array) -> Array:
         refuse(wrong, "overflow", lambda i: f"{n[i]} is not a number of bits from 0 to {_MOST_BITS - 1}")
         n = set_null(n, wrong)
     if sign == ">>":
-        return pc.shift_right(x, n)
-    result = pc.shift_left(x, n)
-    overflow = true_mask(pc.not_equal(pc.shift_right(result, n), x))
+        return _in_two_steps(pc.shift_right, x, n)
+    result = _in_two_steps(pc.shift_left, x, n)
+    overflow = true_mask(pc.not_equal(_in_two_steps(pc.shift_right, result, n), x))
     if overflow.any():
         refuse(overflow, "overflow", lambda i: f"{x[i]} << {n[i]} has more than 64 bits")
     return result
+
+
+def _in_two_steps(shift: Callable[[Array, Array], Array], x: Array, n: Array) -> Array:
+    """Shift by `n` bits in two steps, because Arrow returns signed integers unchanged for 63 bits."""
+    half = pc.shift_right(n, 1)
+    return shift(shift(x, half), pc.subtract(n, half))
 
 
 @function(INTEGER, INTEGER, returns=_left_shift_type, name="<<")
