@@ -65,7 +65,7 @@ class WebFiles(FileSystemHandler):
         )
 
     def request(self, path: str, start: int, stop: int) -> tuple[Any, str]:
-        """Return the response to a request for a range of a file, and the URL without its query.
+        """Return the response of urllib3 to a request for a range of a file, and the URL without its query.
 
         Raises:
             FileNotFoundError: The file does not exist.
@@ -172,7 +172,7 @@ class WebFiles(FileSystemHandler):
             "a web server cannot be written", where=self._root, hint="use a folder, s3://, gs:// or az://"
         )
 
-    _refused: Any = _refuse
+    _refused: Any = _refuse  # the overridden methods have different signatures
     create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _refused
     delete_file = move = copy_file = open_output_stream = open_append_stream = _refused
 

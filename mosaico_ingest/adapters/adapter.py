@@ -111,7 +111,7 @@ class Envelope(Struct, frozen=True):
     sequences: NDArray[np.int64] | None = None
     """Sequence numbers, shape (n,); None if all are 0."""
     indices: NDArray[np.int64] | None = None
-    """Positions of the messages among those of their topic, shape (n,); None if the batch starts with the topic."""
+    """Positions of the messages in their topic, shape (n,); None if the batch starts with the topic."""
 
     def take(self, rows: NDArray[Any]) -> Envelope:
         """Return the envelope of some rows, given by a mask or by positions."""

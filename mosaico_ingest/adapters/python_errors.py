@@ -52,7 +52,7 @@ def error_text(error: Exception) -> str:
 def location_of(adapter: type[Any], method: str, error: Exception | None = None) -> str:
     """Return `file:line` of an exception in the files of an adapter class, else of the method; "" if it has no source.
 
-    The deepest line in these files is the location, so that an exception in a library names the adapter's call.
+    The deepest line in these files is the location, so the location of an exception in a library is the adapter's call.
     """
     codes = list(_codes(adapter))
     files = {code.co_filename for code in codes}
@@ -77,7 +77,7 @@ def _codes(adapter: type[Any]) -> Iterator[Any]:
 
 @lru_cache(maxsize=64)
 def _field_names(shape: pa.DataType) -> str:
-    """Return the fields of a message type, also those of nested messages, as adapters access them."""
+    """Return the fields of a message type, including nested messages, as adapters access them."""
     names = list(_paths(shape, ""))
     more = f", … ({len(names) - _FIELDS} more)" if len(names) > _FIELDS else ""
     return ", ".join(names[:_FIELDS]) + more if names else "none"

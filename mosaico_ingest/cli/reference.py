@@ -27,7 +27,7 @@ have [their own page](exit-codes.md).
 
 def cli_reference() -> str:
     """Return docs/cli.md, with a section for each command."""
-    root: Any = get_command(command_line())
+    root: Any = get_command(command_line())  # a class of typer or click, by version
     sections = [_section(path, command) for path, command in _commands(root, "ingest")]
     return f"{_HEAD}\n{''.join(sections)}"
 
@@ -91,7 +91,7 @@ def _names(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by 
 
 
 def _choices(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
-    """Return the words that an option accepts; the attribute with its type depends on the version of typer."""
+    """Return the words that an option accepts. The attribute with its type, and the class of the type, depend on the version of typer."""
     descriptor = getattr(option, "type_descriptor", None)
     kind: Any = descriptor.annotation if descriptor is not None else option.type
     words: Any = kind if isinstance(kind, type) and issubclass(kind, Enum) else getattr(kind, "choices", ())

@@ -87,7 +87,7 @@ def attach_files(plan: Plan, recording: Recording, session: Session, observe: Ob
     """
     if not plan.attachments or not destination_of(plan.destination).can_attach:
         return
-    attachable = cast("AttachableSession", session)
+    attachable = cast("AttachableSession", session)  # as `can_attach` promises
     for attachment in plan.attachments:
         file = Attached(attachment.name, attachment.media_type, attachment.log_ns, attachment.create_ns)
         try:

@@ -91,7 +91,7 @@ def _tried(
         connection.topic, connection.msgtype, block.log_times, block.publish_times, block.sequences
     ).take(decoded.index)
     adapted = adapter.adapt(decoded.rows, envelope)
-    values = cast("Any", decoded.rows).to_pylist()
+    values = cast("Any", decoded.rows).to_pylist()  # the stubs lack to_pylist of struct arrays
     messages = dict(zip(decoded.index.tolist(), values, strict=True))
     rejected = {failure.row: f"[{failure.rule}] {failure.reason}" for failure in decoded.failures}
     rejected |= {

@@ -92,7 +92,7 @@ def _fields(tag: str, struct: pa.StructType, prefix: str) -> Iterator[OntologyFi
         path = f"{prefix}{field.name}"
         unit = column_unit(tag, path.replace("[]", ""))
         yield OntologyField(path, format_type(field.type), field.nullable, unit)
-        element: Any = field.type
+        element: Any = field.type  # the stubs of nested types are incomplete
         while is_list(element):
             element, path = element.value_type, f"{path}[]"
         if pt.is_struct(element):

@@ -83,7 +83,7 @@ def _sorted_table(name: str, topic: TopicInfo | pa.Table) -> pa.Table:
 
 
 def _times_of(table: pa.Table) -> Int64s:
-    column: Any = table.column(TIME)
+    column: Any = table.column(TIME)  # the stubs do not declare the type of the NumPy array
     return column.to_numpy()
 
 

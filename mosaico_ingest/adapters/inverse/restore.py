@@ -171,13 +171,14 @@ class _PythonInverse(Struct, frozen=True):
     msgtype: str
     shape: pa.StructType
     typestore: Any
-    """A typestore of rosbags, which only `rosbag` imports."""
+    """A typestore of rosbags; its type is not named here because only `rosbag` imports the library."""
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         stored: Any = rows  # the stubs lack to_pylist of struct arrays
         times: list[int] = envelope.log_times.tolist()
         messages = [self._message(row, time) for row, time in zip(stored.to_pylist(), times, strict=True)]
         try:
+            # The stubs do not derive the array class from the type.
             restored = cast("pa.StructArray", arrays.array(messages, self.shape))
         except (pa.ArrowException, TypeError, ValueError, OverflowError) as error:
             raise AdapterError(f"a value that {self._method} returns does not fit: {error}") from error

@@ -49,7 +49,7 @@ class _OutputRows(Struct, frozen=True):
     """The rows that one output has of a batch."""
 
     rows: Any
-    """A struct array."""
+    """A struct array, whose members the stubs do not declare."""
     messages: NDArray[np.int64]
     """The position of each row's message in the batch."""
     dropped: NDArray[np.bool_]

@@ -300,14 +300,13 @@ class Catalog:
             catalog.is_current = create
 
     def _create_atomically(self) -> None:
-        """Create the catalog under its name only when it is initialized, so that no process sees half of it."""
+        """Create the catalog under its name only when it is initialized, so that no process sees an incomplete catalog."""
         draft = self.path.with_name(f".{self.path.name}-{secrets.token_hex(8)}")
         try:
             with closing(connect(draft, "mode=rwc")) as db:
                 _initialize(db, draft)
-                _use_wal(
-                    db
-                )  # not earlier: on a full disk, the tables would stay in the log, which is not linked
+                # On a full disk, an earlier log would keep the tables, and the log is not linked.
+                _use_wal(db)
             try:
                 os.link(draft, self.path)
             except FileExistsError:

@@ -20,6 +20,7 @@ def check(job: Job) -> Iterator[Problem]:
         if source is None:
             continue
         parameters = source.at(("parameters",))
+        # `isinstance` does not narrow the types of keys and values.
         defaults = cast("dict[str, Any]", parameters) if isinstance(parameters, dict) else {}
         for name, value in adapter.values.items():
             problem, hint = parameter_problem(defaults, name, value)

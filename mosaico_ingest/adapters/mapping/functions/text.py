@@ -173,7 +173,7 @@ def _format_problem(template: Any, *values: Any) -> str | None:  # noqa: ANN401 
 def format_(template: str, x: Array, *others: Array) -> Array:
     """Text with `{}` replaced by the values, as in `format('{}: {:.2f} V', name, volts)`; formats as in Python."""
     values = iter((x, *others))
-    pieces: list[Any] = []
+    pieces: list[Any] = []  # texts and arrays
     for literal, name, specification, _ in Formatter().parse(template):
         pieces.append(literal)
         if name is not None:
