@@ -158,6 +158,7 @@ CASES = [
     ("number(x)", TEXT, ["1.5", " 2 ", None], [1.5, 2.0, None]),
     ("bytes(x)", pa.list_(U1, 2), [[1, 2], [3, 4]], [b"\1\2", b"\3\4"]),
     ("bytes(x)", pa.list_(U1), [[1, 2], [], None], [b"\1\2", b"", None]),
+    ("bytes(x)", pa.list_(U1), [[1, None], [2]], [None, b"\2"]),
     ("bytes(x)", pa.binary(), [b"a"], [b"a"]),
     ("ros_time(x)", STAMP, [{"sec": 1, "nanosec": 2}, None], [{"seconds": 1, "nanoseconds": 2}, None]),
     ("seconds(x)", STAMP, [{"sec": -1, "nanosec": 500_000_000}], [-0.5]),

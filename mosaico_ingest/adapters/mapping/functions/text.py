@@ -10,6 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.mapping.columns import Array, arrays, null_mask, open_list, pc, pt
+from mosaico_ingest.adapters.mapping.functions.lists import absent_rows
 from mosaico_ingest.adapters.mapping.functions.registry import (
     TEXT,
     TEXT_LITERAL,
@@ -213,12 +214,12 @@ def number(refuse: RejectRows, s: Array) -> Array:
 
 @function(_BYTES, returns=arrays.binary())
 def bytes_(x: Array) -> Array:
-    """A list of uint8 as bytes."""
+    """A list of uint8 as bytes; null if an element is null."""
     if pt.is_binary(x.type) or pt.is_null(x.type):
         return pc.cast(x, arrays.binary())
     elements, axis = open_list(x)
     data = arrays.py_buffer(np.ascontiguousarray(np.asarray(pc.fill_null(elements, 0))))
-    absent = null_mask(x)
-    validity = None if absent is None else arrays.array(~absent).buffers()[1]
+    absent = absent_rows(elements, axis)
+    validity = arrays.array(~absent).buffers()[1] if absent.any() else None
     offsets = arrays.py_buffer(axis.offsets.astype(np.int32))
     return arrays.Array.from_buffers(arrays.binary(), len(x), [validity, offsets, data])
