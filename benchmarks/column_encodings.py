@@ -2,8 +2,8 @@
 
     ./dev bench column_encodings RECORDING...
 
-The bound is the entropy of the floating-point columns whose values hardly repeat: sign, exponent and the first 8 bits of the
-mantissa by their frequencies, and the other 44 bits as they are. The values of the benchmarks are independent random numbers, so
+The bound is the entropy of the floating-point columns with few repeated values: sign, exponent and the first 8 bits of the
+mantissa by their frequencies, and the other 44 bits without compression. The values of the benchmarks are independent random numbers, so
 a smaller file is not possible.
 """
 

@@ -160,7 +160,7 @@ def _gs(_bucket: str, options: dict[str, str], network: Network) -> FileSystem:
 
 
 def _az(_container: str, options: dict[str, str], _network: Network) -> FileSystem:
-    """Return the file system of Azure; its client has timeouts and retries of its own."""
+    """Return the file system of Azure; its client has its own timeouts and retries."""
     try:
         from pyarrow.fs import AzureFileSystem  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
     except ImportError as error:

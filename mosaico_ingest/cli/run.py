@@ -216,7 +216,8 @@ def bag(
     ] = None,
     topics: TopicsOption = None,
     more_topics: Annotated[
-        list[str] | None, typer.Argument(metavar="TOPIC", help="More topics, after those of --topics.")
+        list[str] | None,
+        typer.Argument(metavar="TOPIC", help="More topics, added after the topics of --topics."),
     ] = None,
     metadata: Annotated[
         str | None,

@@ -95,7 +95,7 @@ def watch(
             "--unfinished-rest",
             min=0.0,
             metavar="SECONDS",
-            help="The same for a recording whose end is missing: it may still be written, or its recorder crashed.",
+            help="Time without a change after which a recording without its end is ingested; it may still be written, or its recorder crashed.",
         ),
     ] = 600.0,
     every: Annotated[

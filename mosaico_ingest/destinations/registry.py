@@ -1,4 +1,4 @@
-"""The registry of destinations: the store, the server, and those of installed packages.
+"""The registry of destinations: the store, the server, and the destinations of installed packages.
 
 A package adds a destination with an entry point of the group `mosaico_ingest.destinations`:
 

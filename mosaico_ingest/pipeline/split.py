@@ -1,6 +1,6 @@
 """Split a job into one job per part of its recording (`split`).
 
-Each part is a job of its own, so a part has the rows that `bag.time` with the part's range would select. If the times of
+Each part is a separate job, so a part has the rows that `bag.time` with the part's range would select. If the times of
 all topics are log times, the index of the recording decides which parts have messages, and each part reads only its own
 range. Otherwise the recording is read once more to find the log times between which the messages of each part lie.
 """

@@ -43,7 +43,7 @@ class Arrivals:
     rest_s: float
     """Seconds without a change after which a recording is complete."""
     unfinished_rest_s: float = 600.0
-    """The same for a recording whose end is missing: its upload may have stalled, or its recorder crashed."""
+    """Seconds without a change for a recording without its end: its upload may have stalled, or its recorder crashed."""
     _arrivals: dict[AnyPath, _Arrival] = field(default_factory=dict)
 
     def settled(self, now: float) -> tuple[AnyPath, ...]:

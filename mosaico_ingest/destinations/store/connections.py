@@ -111,7 +111,7 @@ def find_open(path: Path) -> OpenCatalog | None:
 
 @contextmanager
 def connection(
-    path: Path, connect_anew: Callable[[], sqlite3.Connection]
+    path: Path, open_connection: Callable[[], sqlite3.Connection]
 ) -> Generator[sqlite3.Connection, None, None]:
     """Yield a connection of the open catalog, or a new one, which is closed afterwards."""
     catalog = find_open(path)
@@ -119,7 +119,7 @@ def connection(
         with catalog.connection(path) as db:
             yield db
         return
-    with closing(connect_anew()) as db:
+    with closing(open_connection()) as db:
         yield db
 
 

@@ -181,15 +181,15 @@ class SequenceDocument(_Part):
 
     def with_replacement(self, change: Replacement) -> SequenceDocument | None:
         """Return the sequence with a merged segment, or None if one of the segments it replaces is gone."""
-        held = next((topic for topic in self.topics if topic.name == change.topic), None)
-        if held is None or not {one.path for one in held.segments}.issuperset(change.replaced):
+        document = next((topic for topic in self.topics if topic.name == change.topic), None)
+        if document is None or not {one.path for one in document.segments}.issuperset(change.replaced):
             return None
         merged = _entry(change.session, change.path, change.segment).model_copy(
             update={"merged": tuple((part.session, part.checksum) for part in change.merged)}
         )
-        remaining = tuple(one for one in held.segments if one.path not in change.replaced)
-        changed = held.model_copy(update={"segments": (*remaining, merged)})
-        topics = tuple(changed if topic is held else topic for topic in self.topics)
+        remaining = tuple(one for one in document.segments if one.path not in change.replaced)
+        changed = document.model_copy(update={"segments": (*remaining, merged)})
+        topics = tuple(changed if topic is document else topic for topic in self.topics)
         return self.model_copy(update={"topics": topics})
 
     def with_note(self, new: NewNote) -> SequenceDocument:
