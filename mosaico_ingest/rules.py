@@ -204,6 +204,9 @@ _TABLE = (
     Rule("ING642", "empty-part", _INFO, "a part of a recording without rows"),
     Rule("ING643", "attachments-not-stored", _WARNING, "attachments that the destination cannot store"),
     Rule("ING644", "damaged-attachment", _WARNING, "an attachment that differs from its checksum"),
+    Rule(
+        "ING650", "no-inverse", _WARNING, "a topic that an export excludes because its adapter has no inverse"
+    ),
     Rule("ING701", "decode", _WARNING, "bytes that do not fit their message type"),
     Rule("ING702", "definition", _WARNING, "a message type without a usable definition"),
     Rule("ING703", "encoding", _WARNING, "a message in an encoding that cannot be decoded"),

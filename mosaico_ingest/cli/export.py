@@ -180,7 +180,7 @@ def _print_export(report: ExportReport, *, stderr: bool) -> None:
 
 def _differences(topic: TopicExport) -> list[str]:
     """Return how the exported messages differ from the original ones."""
-    lines = [f"excluded: {topic.excluded}"] if topic.excluded else []
+    lines = [f"excluded: {topic.exclusion}"] if topic.excluded else []
     if topic.assumed:
         lines.append(f"stored without a definition; {topic.assumed} is assumed")
     lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_invertible.items()]

@@ -21,6 +21,7 @@ from mosaico_ingest.adapters.bridge import ROSBridge, adapter_spec, outputs_of
 from mosaico_ingest.adapters.builtin import BUILTIN
 from mosaico_ingest.adapters.inverse import Inverse, Restored, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
+from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.containers import ROS_VERSIONS
 from mosaico_ingest.destinations.store import Store
@@ -65,6 +66,15 @@ class TopicExport(_Record):
     """Columns that would differ if the file were ingested, with the number of rows."""
     excluded: str = ""
     """The reason why the topic is not in the file; empty if it is."""
+    rule: str = ""
+    """The id of the rule for the exclusion, such as `no-inverse`; empty if there is none."""
+    location: str = ""
+    """File, line and column of the cause, if an adapter file is the cause."""
+
+    @property
+    def exclusion(self) -> str:
+        """The reason for the exclusion with its location and rule id, as findings are printed."""
+        return f"{self.location}: warning[{self.rule}] {self.excluded}" if self.rule else self.excluded
 
     @property
     def faithful(self) -> bool:
@@ -243,12 +253,20 @@ def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[Adap
             mismatches.append(error.what)
             continue
         if _produces(adapter, info):
+            if isinstance(spec, MappingSpec) and isinstance(adapter, MappingAdapter):
+                _check_inverse(spec, adapter)
             inverse = invert(adapter, definition, info.metadata)
             return Restorer(info, definition, spec.name, adapter.ontology, inverse)
     raise AdapterError(
         f"no known adapter converts {definition.root} to {info.ontology.tag}",
         hint=mismatches[0] if mismatches else "select the adapter of the topic with --adapter",
     )
+
+
+def _check_inverse(spec: MappingSpec, adapter: MappingAdapter) -> None:
+    """Raise an error with the location in the adapter file if the adapter has no inverse."""
+    if finding := spec.inverse_finding(adapter):
+        raise AdapterError(finding.message, where=str(finding.span), findings=(finding,))
 
 
 def _candidates(
@@ -382,7 +400,7 @@ def _logged(report: ExportReport) -> ExportReport:
         _log.warning("%s: the file cannot contain %s", report.sequence, line)
     for topic in report.topics:
         if topic.excluded:
-            _log.warning("%s of %s is not exported: %s", topic.topic, report.sequence, topic.excluded)
+            _log.warning("%s of %s is not exported: %s", topic.topic, report.sequence, topic.exclusion)
             continue
         for column, count in topic.changed.items():
             _log.warning("%s of %s: %s differs in %s messages", topic.topic, report.sequence, column, count)
@@ -447,7 +465,11 @@ def _restorer(
     try:
         return restorer_for(info, origin.definition(version), specs)
     except (AdapterError, BagError) as error:
-        return _excluded(info, origin.msgtype, _reason(error))
+        excluded = _excluded(info, origin.msgtype, _reason(error))
+        finding = next(iter(error.findings), None)
+        if finding is None:
+            return excluded
+        return excluded.model_copy(update={"rule": finding.rule, "location": str(finding.span or "")})
 
 
 def _connected(restorer: Restorer, writer: RecordingWriter) -> tuple[int, Restorer] | TopicExport:
@@ -467,7 +489,7 @@ def _excluded(info: SourceTopic, msgtype: str, reason: str) -> TopicExport:
 
 
 def _first_reason(excluded: Sequence[TopicExport]) -> str:
-    return f"{excluded[0].topic}: {excluded[0].excluded}"
+    return f"{excluded[0].topic}: {excluded[0].exclusion}"
 
 
 def _messages(

@@ -204,16 +204,28 @@ def test_contract_counts_rejected_messages_and_not_rows(tmp_path: Path) -> None:
         assert contract.passed, contract
 
 
-@pytest.mark.parametrize(("adapter", "topic"), [(ROWS_FILE, "/batch"), (OUTPUTS_FILE, "/batch/heavy")])
-def test_export_of_several_rows_or_topics_is_refused(tmp_path: Path, adapter: str, topic: str) -> None:
+@pytest.mark.parametrize(
+    ("adapter", "topic", "key"),
+    [
+        (ROWS_FILE, "/batch", "rows:"),
+        (OUTPUTS_FILE, "/batch/items", "    rows:"),
+        (OUTPUTS_FILE, "/batch/heavy", "outputs:"),
+    ],
+)
+def test_export_of_several_rows_or_topics_is_refused_at_their_key(
+    tmp_path: Path, adapter: str, topic: str, key: str
+) -> None:
     recording(tmp_path)
     run(tmp_path, adapter)
-    store = Store.open(tmp_path / "store")
+    file = tmp_path / "items.yaml"
     report = export_sequence(
-        store, "s", tmp_path / "out.mcap", adapters=[str(tmp_path / "items.yaml")], dry_run=True
+        Store.open(tmp_path / "store"), "s", tmp_path / "out.mcap", adapters=[str(file)], dry_run=True
     )
-    reasons = {one.topic: one.excluded for one in report.topics}
-    assert "has no inverse" in reasons[topic]
+    excluded = {one.topic: one for one in report.topics}[topic]
+    line = next(at for at, text in enumerate(adapter.splitlines(), 1) if text.startswith(key))
+    column = len(key) - len(key.lstrip()) + 1
+    assert (excluded.rule, excluded.location) == ("no-inverse", f"{file}:{line}:{column}")
+    assert excluded.exclusion.startswith(f"{file}:{line}:{column}: warning[no-inverse] ")
 
 
 def test_message_properties_equal_recording(tmp_path: Path) -> None:

@@ -119,9 +119,8 @@ def invert(adapter: Adapter, definition: Definition, metadata: Mapping[str, Any]
     if isinstance(adapter, UnmodeledAdapter):
         return _UnmodeledInverse(shape, definition.language is not Language.ROS)
     if isinstance(adapter, MappingAdapter):
-        if adapter.levels or adapter.others:
-            cause = "several rows" if adapter.levels else "several topics"
-            raise AdapterError(f"the adapter converts each message to {cause}, so it has no inverse")
+        if adapter.inverse_problem is not None:
+            raise AdapterError(adapter.inverse_problem)
         texts = _metadata_texts(adapter.metadata, metadata)
         return _MappingInverse(adapter, shape, texts, definition.language is not Language.ROS)
     if isinstance(adapter, PythonAdapter) and adapter.is_invertible:

@@ -75,6 +75,14 @@ class MappingAdapter(Struct, frozen=True):
         """Whether each message that is not rejected becomes exactly one row."""
         return not (self.drops or self.levels or self.others)
 
+    @property
+    def inverse_problem(self) -> str | None:
+        """The reason why no message can be restored from one row; None if it can."""
+        if not (self.levels or self.others):
+            return None
+        cause = "several rows" if self.levels else "several topics"
+        return f"the adapter converts each message to {cause}, so it has no inverse"
+
     def adapt(self, rows: pa.StructArray, envelope: Envelope) -> Adapted:
         """Adapt a batch; rows that do not fit become failures."""
         if not self.is_plain:
@@ -208,6 +216,15 @@ class MappingSpec:
             MappingSpec(self.model, self.origin, _known_ontology(record), self.adapters, name)
             for name, record in records_of(self.model).items()
         )
+
+    def inverse_finding(self, adapter: MappingAdapter) -> Finding | None:
+        """Return why an adapter that is bound to a definition has no inverse, located at `rows` or `outputs`."""
+        if adapter.inverse_problem is None:
+            return None
+        output = self.output or next(iter(records_of(self.model)))
+        outputs = () if self.model.outputs is None else ("outputs", output)
+        span = self.source.key_span((*outputs, "rows") if adapter.levels else ("outputs",))
+        return Finding("no-inverse", Severity.WARNING, adapter.inverse_problem, span)
 
     def with_parameters(self, values: Mapping[str, Scalar]) -> MappingSpec:
         """Return the adapter with other values of its parameters.
