@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("pty", reason="only POSIX systems have pseudo terminals")
+pytest.importorskip("fcntl", reason="only POSIX systems have pseudo terminals")
 from terminal import in_terminal, printed_lines
 
 ROOT = Path(__file__).resolve().parents[2]
