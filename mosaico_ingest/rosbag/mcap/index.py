@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Collection, Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
+from typing import TypeVar
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -30,6 +32,8 @@ from mosaico_ingest.rosbag.mcap.records import (
 )
 from mosaico_ingest.rosbag.recovery import find_mcap_chunk
 from mosaico_ingest.rosbag.source import Fields, Source, Window
+
+T = TypeVar("T")
 
 _FOOTER_BYTES = RECORD.size + 20
 _INDEX_ENTRY_BYTES = 16
@@ -138,11 +142,7 @@ def read_metadata(
     ranges = index.metadata
     if not index.lists_metadata:
         ranges = _walked(source, index, max_chunk_bytes).metadata
-    records: list[MetadataRecord] = []
-    for start, end in ranges:
-        with suppress(BagError):
-            records.append(metadata_of(Fields(source.read(start, end - start))))
-    return records
+    return list(_undamaged(ranges, lambda start, end: metadata_of(Fields(source.read(start, end - start)))))
 
 
 def read_attachments(
@@ -152,11 +152,13 @@ def read_attachments(
     ranges = index.attachments
     if not index.lists_attachments:
         ranges = _walked(source, index, max_chunk_bytes).attachments
-    attachments: list[Attachment] = []
+    return list(_undamaged(ranges, partial(_attachment, source)))
+
+
+def _undamaged(ranges: Iterable[tuple[int, int]], read: Callable[[int, int], T]) -> Iterator[T]:
     for start, end in ranges:
         with suppress(BagError):
-            attachments.append(_attachment(source, start, end))
-    return attachments
+            yield read(start, end)
 
 
 def attachment_chunks(source: Source, attachment: Attachment) -> Iterator[bytes]:
