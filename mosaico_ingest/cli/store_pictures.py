@@ -25,7 +25,7 @@ CHART_HEIGHT = 16
 CHART_WIDTH = 120
 """Maximum number of columns of a chart."""
 STYLES = ("cyan", "yellow", "green", "magenta", "red", "blue", "bright_cyan", "bright_yellow")
-"""Colours of the series of a chart."""
+"""Colors of the series of a chart."""
 
 StartOption = Annotated[
     str | None, typer.Option("--from", metavar="TIME", help="Start here: a time, or an offset such as +10s.")
@@ -106,7 +106,7 @@ def image(
     ] = 800,
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
-    """Write the picture of a row: images in their colours, depth colour-mapped, point clouds from above."""
+    """Write the picture of a row: images in their colors, depth color-mapped, point clouds from above."""
     from mosaico_ingest.view.images import write_picture
     from mosaico_ingest.view.pictures import row_picture
     from mosaico_ingest.view.rows import nearest_row
@@ -133,17 +133,17 @@ def _contact_sheet(topic: TopicInfo, count: int, size: int) -> tuple[Pixels, str
     from mosaico_ingest.view.pictures import thumbnails
 
     pictures = thumbnails(topic, count, size=min(size, 400))
-    labelled = [
+    labeled = [
         (f"+{seconds_text(each.offset_s)}", each.pixels) for each in pictures if each.pixels is not None
     ]
     problems = [each.problem for each in pictures if each.problem is not None]
-    if not labelled:
+    if not labeled:
         raise ViewError(
             problems[0] if problems else "there are no rows", where=f"{topic.sequence}{topic.name}"
         )
     for problem in dict.fromkeys(problems):
         print_line(f"{problems.count(problem)} of {len(pictures)}: {problem}", style="yellow", stderr=True)
-    return contact_sheet(labelled), f"{len(labelled)} pictures"
+    return contact_sheet(labeled), f"{len(labeled)} pictures"
 
 
 def _row_facts(topic: TopicInfo, row: dict[str, object]) -> str:

@@ -1,4 +1,4 @@
-"""Depth images: the colour map, and the payloads of the ROS plugin `compressed_depth_image_transport`."""
+"""Depth images: the color map, and the payloads of the ROS plugin `compressed_depth_image_transport`."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ _TURBO = np.array(
     ],
     np.float32,
 )
-"""Colours at equal distances of the colour map "Turbo": blue is near, red is far."""
+"""Colors at equal distances of the color map "Turbo": blue is near, red is far."""
 _PERCENTILES = (1.0, 99.0)
 _PNG = b"\x89PNG"
 _HEADER = struct.Struct("<iff")
@@ -27,10 +27,10 @@ _LARGEST = 1 << 28
 """Pixels above which the sizes in a payload are not credible."""
 
 
-def colour_map(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
+def color_map(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     """Return measurements of shape (height, width) as RGB; zeros, NaN and infinities are black.
 
-    The colours span the range from the 1st to the 99th percentile, so that outliers do not hide the rest.
+    The colors span the range from the 1st to the 99th percentile, so that outliers do not hide the rest.
     """
     mask = np.isfinite(values) & (values != 0)
     pixels = np.zeros((*values.shape, 3), np.uint8)

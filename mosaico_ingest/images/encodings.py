@@ -11,7 +11,7 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import colour_map
+from mosaico_ingest.images.depth import color_map
 
 Pixels: TypeAlias = npt.NDArray[np.uint8]
 """An RGB picture, of shape (height, width, 3)."""
@@ -20,12 +20,12 @@ _Array: TypeAlias = npt.NDArray[Any]
 _OPENCV = re.compile(r"(8U|8S|16U|16S|32S|32F|64F)C(\d*)")
 _OPENCV_TYPES = {"8U": "u1", "8S": "i1", "16U": "u2", "16S": "i2", "32S": "i4", "32F": "f4", "64F": "f8"}
 _BAYER = re.compile(r"bayer_(rggb|bggr|gbrg|grbg)(8|16)")
-_COLOURS = {
+_COLORS = {
     f"{order}{bits}": (order, f"u{bits // 8}") for order in ("rgb", "bgr", "rgba", "bgra") for bits in (8, 16)
 }
 _OPENCV_ORDER = "bgra"
 _EIGHT_BITS = 8
-_COLOUR_AXES = 3
+_COLOR_AXES = 3
 """Height, width and channels."""
 
 
@@ -45,7 +45,7 @@ class Samples(Struct, frozen=True):
     """The samples of a raw image: a picture, or measurements such as depth."""
 
     values: _Array
-    """Grey values or measurements of shape (height, width), or colours of shape (height, width, n): RGB, RGBA, or two
+    """Gray values or measurements of shape (height, width), or colors of shape (height, width, n): RGB, RGBA, or two
     measurements per pixel."""
     is_measured: bool = False
 
@@ -59,8 +59,8 @@ def raw_samples(image: RawImage) -> Samples:
     encoding = image.encoding.strip()
     if image.width <= 0 or image.height <= 0:
         raise ViewError(f"the image has {image.width} x {image.height} pixels")
-    if encoding in _COLOURS:
-        order, kind = _COLOURS[encoding]
+    if encoding in _COLORS:
+        order, kind = _COLORS[encoding]
         return Samples(_ordered(_samples(image, kind, len(order)), order))
     if encoding in {"mono8", "mono16", "8UC1", "8UC", "8UC01"}:
         return Samples(_samples(image, "u2" if encoding == "mono16" else "u1", 1)[..., 0])
@@ -78,7 +78,7 @@ def raw_samples(image: RawImage) -> Samples:
 
 
 def raw_pixels(image: RawImage) -> Pixels:
-    """Return the pixels of a raw image as RGB; depth and other measurements are colour-mapped.
+    """Return the pixels of a raw image as RGB; depth and other measurements are color-mapped.
 
     Raises:
         ViewError: The encoding is unknown, or the buffer is too short.
@@ -86,9 +86,9 @@ def raw_pixels(image: RawImage) -> Pixels:
     samples = raw_samples(image)
     values = samples.values
     if samples.is_measured:
-        return colour_map(np.hypot(values[..., 0], values[..., 1]) if values.ndim == _COLOUR_AXES else values)
+        return color_map(np.hypot(values[..., 0], values[..., 1]) if values.ndim == _COLOR_AXES else values)
     pixels = eight_bits(values)
-    return grey(pixels) if pixels.ndim < _COLOUR_AXES else np.ascontiguousarray(pixels[..., :3])
+    return gray(pixels) if pixels.ndim < _COLOR_AXES else np.ascontiguousarray(pixels[..., :3])
 
 
 def eight_bits(values: _Array) -> Pixels:
@@ -102,22 +102,22 @@ def is_bayer(encoding: str) -> str | None:
     return match[1] if match else None
 
 
-def grey(values: Pixels) -> Pixels:
-    """Return grey values of shape (height, width) as RGB."""
+def gray(values: Pixels) -> Pixels:
+    """Return gray values of shape (height, width) as RGB."""
     return np.repeat(values[..., np.newaxis], 3, axis=2)
 
 
 def demosaic(mosaic: _Array, pattern: str) -> _Array:
-    """Return the colours of a Bayer mosaic of shape (height, width) with its sample type, interpolated from neighbouring pixels.
+    """Return the colors of a Bayer mosaic of shape (height, width) with its sample type, interpolated from neighboring pixels.
 
-    `pattern` has the colours of the first two rows, such as `rggb`.
+    `pattern` has the colors of the first two rows, such as `rggb`.
     """
     height, width = mosaic.shape
     pixels = np.empty((height, width, 3), mosaic.dtype)
-    for channel, colour in enumerate("rgb"):
+    for channel, color in enumerate("rgb"):
         mask = np.zeros((height, width), np.float32)
         for at, letter in enumerate(pattern):
-            if letter == colour:
+            if letter == color:
                 mask[at // 2 :: 2, at % 2 :: 2] = 1
         values = _blur(mask * mosaic) / np.maximum(_blur(mask), 1e-6)
         pixels[..., channel] = np.where(mask > 0, mosaic, np.rint(values))
@@ -125,7 +125,7 @@ def demosaic(mosaic: _Array, pattern: str) -> _Array:
 
 
 def _blur(values: npt.NDArray[np.floating[Any]]) -> npt.NDArray[np.floating[Any]]:
-    """Return the sums of 3 x 3 neighbours with the weights 1, 2, 1 along each axis."""
+    """Return the sums of 3 x 3 neighbors with the weights 1, 2, 1 along each axis."""
     padded = np.pad(values, 1)
     rows = padded[:-2] + 2 * padded[1:-1] + padded[2:]
     return rows[:, :-2] + 2 * rows[:, 1:-1] + rows[:, 2:]
@@ -164,14 +164,14 @@ def _eight_bits(samples: _Array) -> Pixels:
 
 def _ordered(samples: _Array, order: str) -> _Array:
     """Return the channels as RGB or RGBA."""
-    colours = "rgba"[: len(order)]
-    if order == colours:
+    colors = "rgba"[: len(order)]
+    if order == colors:
         return samples
-    return np.ascontiguousarray(samples[..., [order.index(colour) for colour in colours]])
+    return np.ascontiguousarray(samples[..., [order.index(color) for color in colors]])
 
 
 def _opencv_samples(image: RawImage, depth: str, channels: int) -> Samples:
-    """Return the samples of an OpenCV matrix: three or four channels are colours in OpenCV's order."""
+    """Return the samples of an OpenCV matrix: three or four channels are colors in OpenCV's order."""
     samples = _samples(image, _OPENCV_TYPES[depth], channels)
     if channels > 2:  # noqa: PLR2004 - fewer channels are measurements
         return Samples(_ordered(samples, _OPENCV_ORDER[:channels]))
@@ -259,7 +259,7 @@ _YUV: dict[str, Callable[[RawImage], Pixels]] = {
     "yuv444": _packed_444,
 }
 ENCODINGS = (
-    *_COLOURS,
+    *_COLORS,
     *("mono8", "mono16"),
     *(f"bayer_{pattern}{bits}" for pattern in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)),
     *_YUV,

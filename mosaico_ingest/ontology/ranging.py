@@ -70,18 +70,18 @@ class PointCloud2(Stamped, Serializable):
     """Whether all points are valid."""
 
 
-class _Coloured(Cloud):
+class _Colored(Cloud):
     rgb: list[Float32] | None = None
-    """The colour, packed as 0x00rrggbb into the bits of a float."""
+    """The color, packed as 0x00rrggbb into the bits of a float."""
     intensity: list[Float32] | None = None
     """Brightness in the sensor's unit."""
 
 
-class RGBDCamera(_Coloured, Serializable):
+class RGBDCamera(_Colored, Serializable):
     """A point cloud of a structured-light camera."""
 
 
-class ToFCamera(_Coloured, Serializable):
+class ToFCamera(_Colored, Serializable):
     """A point cloud of a time-of-flight camera."""
 
     noise: list[Float32] | None = None
@@ -90,7 +90,7 @@ class ToFCamera(_Coloured, Serializable):
     """Brightness under the camera's own illumination."""
 
 
-class StereoCamera(_Coloured, Serializable):
+class StereoCamera(_Colored, Serializable):
     """A point cloud of a stereo camera."""
 
     luma: list[UInt8] | None = None

@@ -12,8 +12,8 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import colour_map
-from mosaico_ingest.images.encodings import Pixels, grey
+from mosaico_ingest.images.depth import color_map
+from mosaico_ingest.images.encodings import Pixels, gray
 
 _NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """The types of point fields, from code 1 (INT8) to 8 (FLOAT64)."""
@@ -76,7 +76,7 @@ def row_points(row: Mapping[str, Any]) -> Points:
 
 
 def from_above(points: Points, *, size: int = 800) -> Pixels:
-    """Return the points from above, to scale: x points to the right, y points up, colours show the height.
+    """Return the points from above, to scale: x points to the right, y points up, colors show the height.
 
     The picture has at most `size` x `size` pixels. The grid has lines every 1, 2, 5, 10, … m; a few outliers are cropped.
     """
@@ -107,7 +107,7 @@ def from_above(points: Points, *, size: int = 800) -> Pixels:
     columns, rows = at[inside][order].T
     is_flat = float(np.ptp(heights)) == 0
     shades = np.ones(len(order)) if is_flat else heights[inside][order] - float(heights.min()) + 1
-    colours = np.full((len(order), 3), 230, np.uint8) if is_flat else colour_map(shades[np.newaxis])[0]
+    colors = np.full((len(order), 3), 230, np.uint8) if is_flat else color_map(shades[np.newaxis])[0]
     radius = 1 if size >= _LARGE_PICTURE else 0  # single pixels are hard to see in a large picture
     radius += 2 if len(order) < _FEW_POINTS else 0
     for offset_y in range(radius + 1):
@@ -115,7 +115,7 @@ def from_above(points: Points, *, size: int = 800) -> Pixels:
             pixels[
                 np.clip(height - 1 - rows + offset_y, 0, height - 1),
                 np.clip(columns + offset_x, 0, width - 1),
-            ] = colours
+            ] = colors
     return pixels
 
 
@@ -126,7 +126,7 @@ def grid_step(extent_m: float) -> float:
 
 
 def grid_pixels(row: Mapping[str, Any]) -> Pixels:
-    """Return an occupancy grid: free cells are white, occupied cells black, unknown cells grey; y points up.
+    """Return an occupancy grid: free cells are white, occupied cells black, unknown cells gray; y points up.
 
     Raises:
         ViewError: The number of cells differs from width times height.
@@ -136,7 +136,7 @@ def grid_pixels(row: Mapping[str, Any]) -> Pixels:
     if not 0 < width * height <= _LARGEST_PIXELS or cells.size != width * height:
         raise ViewError(f"the grid has {width} x {height} cells, but {cells.size} values")
     shades = np.where(cells < 0, _UNKNOWN, 255 - np.clip(cells, 0, 100) * 255 // 100).astype(np.uint8)
-    return grey(np.flipud(shades.reshape(height, width)))
+    return gray(np.flipud(shades.reshape(height, width)))
 
 
 def _is_list_of_points(kind: pa.DataType) -> bool:

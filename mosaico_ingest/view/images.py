@@ -13,13 +13,13 @@ import pyarrow as pa
 
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.images.depth import (
-    colour_map,
+    color_map,
     depth_from_inverse,
     depth_parameters,
     depth_payload,
     run_length_depth,
 )
-from mosaico_ingest.images.encodings import Pixels, RawImage, demosaic, eight_bits, grey, is_bayer, raw_pixels
+from mosaico_ingest.images.encodings import Pixels, RawImage, demosaic, eight_bits, gray, is_bayer, raw_pixels
 from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
 
 VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
@@ -27,7 +27,7 @@ VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
 _GAP = 4
 """Pixels between the pictures of a contact sheet."""
 _BACKGROUND = 32
-"""Grey value between the pictures of a contact sheet."""
+"""Gray value between the pictures of a contact sheet."""
 _SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 
 
@@ -44,7 +44,7 @@ def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
     """Return the image of a row as RGB pixels of shape (height, width, 3).
 
     `row` has the columns of `Image` or `CompressedImage`, or the fields of the ROS messages. `ros_format` is the format
-    text of a compressed image in the topic's metadata, such as `16UC1; compressedDepth png`. Depth is colour-mapped.
+    text of a compressed image in the topic's metadata, such as `16UC1; compressedDepth png`. Depth is color-mapped.
 
     Raises:
         ViewError: The encoding is not supported, or the bytes do not fit it.
@@ -156,7 +156,7 @@ def _compressed_pixels(data: bytes, codec: str, ros_format: str) -> Pixels:
     """Return the pixels of an image file or of a compressed depth image."""
     encoding = ros_format.partition(";")[0].strip()
     if "compressedDepth" in ros_format or depth_payload(data) is not None:
-        return colour_map(_compressed_depth(data, encoding, ros_format))
+        return color_map(_compressed_depth(data, encoding, ros_format))
     words = {codec.lower(), *ros_format.lower().replace(";", " ").split()}
     video = next((name for name in VIDEO if name in words), None)
     if video is not None:
@@ -187,5 +187,5 @@ def _sample_pixels(samples: npt.NDArray[Any], encoding: str) -> Pixels:
     if pattern is not None:
         return demosaic(eight_bits(samples), pattern)
     if samples.dtype == np.uint8:
-        return grey(samples)
-    return grey(eight_bits(samples)) if encoding == "mono16" else colour_map(samples)
+        return gray(samples)
+    return gray(eight_bits(samples)) if encoding == "mono16" else color_map(samples)

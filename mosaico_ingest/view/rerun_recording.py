@@ -12,7 +12,7 @@ import numpy as np
 from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import ViewError, missing_library
-from mosaico_ingest.images.depth import colour_map
+from mosaico_ingest.images.depth import color_map
 from mosaico_ingest.view.clouds import grid_pixels, has_grid, has_points, row_points
 from mosaico_ingest.view.images import decode_image, has_images
 from mosaico_ingest.view.logs import has_log, log_lines
@@ -129,8 +129,8 @@ class _Sender:
             self._recording.log(path, rerun.VideoStream(getattr(rerun.VideoCodec, codec), sample=data))
             return
         direct = next((kind for start, kind in _DIRECT.items() if bytes(data[:4]).startswith(start)), None)
-        is_colour = not any(word in ros_format for word in ("UC1", "FC1", "bayer", "mono16"))
-        if "encoding" not in row and direct is not None and is_colour:
+        is_color = not any(word in ros_format for word in ("UC1", "FC1", "bayer", "mono16"))
+        if "encoding" not in row and direct is not None and is_color:
             self._recording.log(path, rerun.EncodedImage(contents=data, media_type=direct))
             return
         pixels = decode_image(row, ros_format=ros_format)
@@ -140,8 +140,8 @@ class _Sender:
         points = row_points(row)
         self._frame(viewed.path, row)
         shades = points.xyz[:, 2] if points.values is None else points.values
-        colours = colour_map(shades[np.newaxis].astype(np.float64) + 1e-9)[0] if len(shades) else None
-        self._recording.log(viewed.path, self._rerun.Points3D(points.xyz, colors=colours))
+        colors = color_map(shades[np.newaxis].astype(np.float64) + 1e-9)[0] if len(shades) else None
+        self._recording.log(viewed.path, self._rerun.Points3D(points.xyz, colors=colors))
 
     def _frame(self, path: str, row: Mapping[str, Any]) -> None:
         """Attach an entity to the coordinate frame of a row."""

@@ -157,8 +157,8 @@ def test_points_packed_keeps_bytes(unpack: Unpack, datatype: int, name: str, *, 
     fields = [*_cloud()["fields"], _field(name, datatype, 12)]
     cloud = _cloud(fields=fields, point_step=16, row_step=16, data=data, is_bigendian=big)
     rows = unpack("RGBDCameraAdapter", [cloud]).rows
-    (colour,) = rows.field("rgb").to_pylist()[0]
-    assert struct.pack("<f", colour) == struct.pack("<I", 0x00AABBCC)
+    (color,) = rows.field("rgb").to_pylist()[0]
+    assert struct.pack("<f", color) == struct.pack("<I", 0x00AABBCC)
 
 
 def test_points_empty_cloud_is_empty_list(unpack: Unpack) -> None:

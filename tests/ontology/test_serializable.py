@@ -52,7 +52,7 @@ from mosaico_ingest.ontology.registry import (
 )
 
 
-class Colour(str, Enum):
+class Color(str, Enum):
     RED = "red"
 
 
@@ -70,7 +70,7 @@ class Sonar(Serializable):
     beams: list[float]
     gain: Float32 | None = None
     rotation: Annotated[list[Float64], FixedSize(2)]
-    colour: Colour
+    color: Color
     mode: Literal["a", "b"]
     bearing: Bearing
     track: list[Bearing]
@@ -97,7 +97,7 @@ def test_serializable_columns_follow_annotations() -> None:
             pa.field("beams", pa.list_(pa.field("item", pa.float64())), nullable=False),
             pa.field("gain", pa.float32()),
             pa.field("rotation", pa.list_(pa.field("item", pa.float64()), 2), nullable=False),
-            pa.field("colour", pa.string(), nullable=False),
+            pa.field("color", pa.string(), nullable=False),
             pa.field("mode", pa.string(), nullable=False),
             pa.field("bearing", bearing, nullable=False),
             pa.field("track", pa.list_(pa.field("item", bearing)), nullable=False),

@@ -217,7 +217,7 @@ def test_query_segments_outside_bounds_are_not_opened(filled: Store, monkeypatch
 @pytest.mark.parametrize(
     "question",
     [
-        {"sequence": {"colour": {"$eq": 1}}},
+        {"sequence": {"color": {"$eq": 1}}},
         {"topic": {"name": {"$like": "x"}}},
         {"topic": {"name": "x"}},
         {"topic": {"name": {"$between": [1]}}},

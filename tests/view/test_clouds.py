@@ -1,4 +1,4 @@
-"""Points of rows, and pictures from above: right side up, to scale, and coloured by height."""
+"""Points of rows, and pictures from above: right side up, to scale, and colored by height."""
 
 from __future__ import annotations
 
@@ -121,14 +121,12 @@ def test_from_above_has_x_to_the_right_and_y_up() -> None:
     pixels = from_above(Points(corner), size=300).astype(int)
     height, width, _ = pixels.shape
     assert width > height  # to scale
-    colourful = np.argwhere(np.ptp(pixels, axis=2) > 40)
-    top, bottom = colourful[:, 0].min(), colourful[:, 0].max()
-    assert (
-        colourful[colourful[:, 0] == top][:, 1].max() < width / 4
-    )  # the point with y = 5 is at the top left
-    assert colourful[:, 1].max() > width * 3 / 4
+    colorful = np.argwhere(np.ptp(pixels, axis=2) > 40)
+    top, bottom = colorful[:, 0].min(), colorful[:, 0].max()
+    assert colorful[colorful[:, 0] == top][:, 1].max() < width / 4  # the point with y = 5 is at the top left
+    assert colorful[:, 1].max() > width * 3 / 4
     assert bottom > height * 3 / 4
-    high, low = pixels[top, colourful[0, 1]], pixels[bottom, colourful[:, 1].max()]
+    high, low = pixels[top, colorful[0, 1]], pixels[bottom, colorful[:, 1].max()]
     assert high[0] > high[2]  # red
     assert low[2] > low[0]  # blue
 

@@ -1,4 +1,4 @@
-"""Images: each encoding gives the colours of the picture that was encoded."""
+"""Images: each encoding gives the colors of the picture that was encoded."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import colour_map, run_length_depth
+from mosaico_ingest.images.depth import color_map, run_length_depth
 from mosaico_ingest.view.images import contact_sheet, decode_image, fit_pixels, has_images, png_bytes
 
 HEIGHT, WIDTH = 6, 8
@@ -51,7 +51,7 @@ def luma_and_chroma() -> npt.NDArray[np.uint8]:
 @pytest.mark.parametrize("order", ["rgb", "bgr", "rgba", "bgra"])
 @pytest.mark.parametrize("bits", [8, 16])
 @pytest.mark.parametrize("byte_order", ["<", ">"])
-def test_decode_image_colour_encoding_returns_rgb(order: str, bits: int, byte_order: str) -> None:
+def test_decode_image_color_encoding_returns_rgb(order: str, bits: int, byte_order: str) -> None:
     channels = np.stack(
         [picture()[..., "rgb".index(c)] if c != "a" else np.zeros_like(picture()[..., 0]) for c in order], -1
     )
@@ -62,7 +62,7 @@ def test_decode_image_colour_encoding_returns_rgb(order: str, bits: int, byte_or
 
 
 @pytest.mark.parametrize(("encoding", "order"), [("8UC3", "bgr"), ("8UC4", "bgra")])
-def test_decode_image_opencv_colours_are_in_order_of_opencv(encoding: str, order: str) -> None:
+def test_decode_image_opencv_colors_are_in_order_of_opencv(encoding: str, order: str) -> None:
     samples = np.dstack([picture()[..., ["rgb".index(c)]] if c != "a" else picture()[..., :1] for c in order])
     assert np.array_equal(decode_image(row(samples, encoding)), picture())
 
@@ -90,7 +90,7 @@ def test_decode_image_ros_field_step_is_stride() -> None:
 
 @pytest.mark.parametrize("pattern", ["rggb", "bggr", "gbrg", "grbg"])
 @pytest.mark.parametrize("bits", [8, 16])
-def test_decode_image_bayer_of_one_colour_returns_colour_everywhere(pattern: str, bits: int) -> None:
+def test_decode_image_bayer_of_one_color_returns_color_everywhere(pattern: str, bits: int) -> None:
     mosaic = np.empty((HEIGHT, WIDTH), np.uint8)
     for at, letter in enumerate(pattern):
         mosaic[at // 2 :: 2, at % 2 :: 2] = RED["rgb".index(letter)]
@@ -99,7 +99,7 @@ def test_decode_image_bayer_of_one_colour_returns_colour_everywhere(pattern: str
     assert np.array_equal(decoded, np.full((HEIGHT, WIDTH, 3), RED))
 
 
-def test_decode_image_bayer_interpolates_between_neighbours() -> None:
+def test_decode_image_bayer_interpolates_between_neighbors() -> None:
     mosaic = np.zeros((HEIGHT, WIDTH), np.uint8)
     mosaic[0::2, 0::2] = np.arange(0, WIDTH, 2) * 10  # the red pixels of rggb
     decoded = decode_image(row(mosaic, "bayer_rggb8"))
@@ -108,7 +108,7 @@ def test_decode_image_bayer_interpolates_between_neighbours() -> None:
 
 
 @pytest.mark.parametrize("encoding", ["uyvy", "yuv422", "yuyv", "yuv422_yuy2", "yuv444"])
-def test_decode_image_packed_yuv_returns_colours(encoding: str) -> None:
+def test_decode_image_packed_yuv_returns_colors(encoding: str) -> None:
     y, u, v = np.moveaxis(luma_and_chroma(), -1, 0)
     quads = {
         "uyvy": (u[:, ::2], y[:, ::2], v[:, ::2], y[:, 1::2]),
@@ -122,9 +122,9 @@ def test_decode_image_packed_yuv_returns_colours(encoding: str) -> None:
 
 @pytest.mark.parametrize("encoding", ["nv12", "nv21", "nv24", "i420", "yv12"])
 @pytest.mark.parametrize("height", [HEIGHT, HEIGHT - 1])
-def test_decode_image_planar_yuv_returns_colours(encoding: str, height: int) -> None:
+def test_decode_image_planar_yuv_returns_colors(encoding: str, height: int) -> None:
     y, u, v = (plane.copy() for plane in np.moveaxis(luma_and_chroma(), -1, 0))
-    if encoding != "nv24":  # the middle rows have chroma of two colours
+    if encoding != "nv24":  # the middle rows have chroma of two colors
         u, v = u[::2, ::2], v[::2, ::2]
     planes = {
         "nv12": np.dstack([u, v]),
@@ -153,10 +153,10 @@ def test_decode_image_depth_maps_near_to_blue_and_far_to_red(encoding: str) -> N
     assert far[0] > far[2]
 
 
-def test_colour_map_without_finite_values_returns_black() -> None:
-    assert not colour_map(np.full((2, 2), np.nan)).any()
-    assert not colour_map(np.zeros((2, 2))).any()
-    assert colour_map(np.full((2, 2), 7.0)).any()
+def test_color_map_without_finite_values_returns_black() -> None:
+    assert not color_map(np.full((2, 2), np.nan)).any()
+    assert not color_map(np.zeros((2, 2))).any()
+    assert color_map(np.full((2, 2), 7.0)).any()
 
 
 @pytest.mark.parametrize("kind", ["PNG", "WEBP", "BMP", "TIFF"])
@@ -206,7 +206,7 @@ def test_decode_image_compressed_depth_equals_raw_depth() -> None:
     depth = np.linspace(500, 4000, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH).astype(np.uint16)
     data = struct.pack("<iff", 0, 0, 0) + depth_file(depth)
     decoded = decode_image({"data": data, "format": "png"}, ros_format="16UC1; compressedDepth png")
-    assert np.array_equal(decoded, colour_map(depth))
+    assert np.array_equal(decoded, color_map(depth))
 
 
 def test_decode_image_inverse_depth_restores_metres() -> None:
@@ -215,7 +215,7 @@ def test_decode_image_inverse_depth_restores_metres() -> None:
     codes = np.rint(first / depth + second).astype(np.uint16)
     data = struct.pack("<iff", 0, first, second) + depth_file(codes)
     decoded = decode_image({"data": data, "format": "png"}, ros_format="32FC1; compressedDepth png")
-    assert np.abs(decoded.astype(int) - colour_map(depth)).max() <= 3
+    assert np.abs(decoded.astype(int) - color_map(depth)).max() <= 3
 
 
 def run_length(depth: list[int]) -> bytes:
@@ -254,7 +254,7 @@ def test_run_length_depth_returns_encoded_values(starts_with: int) -> None:
     data = struct.pack("<iffII", 0, 0, 0, 4, 3) + run_length(depth)
     assert run_length_depth(data).tolist() == np.reshape(depth, (3, 4)).tolist()
     decoded = decode_image({"data": data, "format": "raw"}, ros_format="16UC1; compressedDepth rvl")
-    assert np.array_equal(decoded, colour_map(np.reshape(depth, (3, 4))))
+    assert np.array_equal(decoded, color_map(np.reshape(depth, (3, 4))))
 
 
 @pytest.mark.parametrize("size", [3, 12, 20, 22])

@@ -140,7 +140,7 @@ def _cast_to(dtype: np.dtype[Any]) -> Convert:
 def _bits(values: Numbers) -> Numbers:
     """Return the four bytes of each value as a float32, whatever type the cloud declares."""
     if values.dtype.itemsize != _PACKED_BYTES:
-        raise _InvalidCloud(f"a packed colour has 4 bytes, not {values.dtype.itemsize}")
+        raise _InvalidCloud(f"a packed color has 4 bytes, not {values.dtype.itemsize}")
     words = values.view(np.dtype(np.uint32).newbyteorder(values.dtype.byteorder))
     return words.astype(np.uint32).view(np.float32)
 
@@ -214,5 +214,5 @@ def points_uint16(refuse: RejectRows, cloud: Array, field: str) -> Array:
 
 @function(_CLOUD, TEXT_LITERAL, returns=_list_of(np.dtype(np.float32)))
 def points_packed(refuse: RejectRows, cloud: Array, field: str) -> Array:
-    """A packed colour of every point: its four bytes as float32, as in PCL, also if the cloud declares uint32."""
+    """A packed color of every point: its four bytes as float32, as in PCL, also if the cloud declares uint32."""
     return _columns(refuse, cloud, field, np.dtype(np.float32), _bits)
