@@ -309,11 +309,11 @@ def run(
         tasks = add_group_results(tasks)
     from mosaico_ingest.pipeline.known import mark_known
 
-    chosen = executor or choose_executor(tasks)
+    executor = executor or choose_executor(tasks)
     return RunReport(
         tool=f"mosaico-ingest {__version__}",
         manifests=tuple(manifests),
-        recordings=tuple(chosen.map(tasks if verify else mark_known(tasks), observe)),
+        recordings=tuple(executor.map(tasks if verify else mark_known(tasks), observe)),
     )
 
 

@@ -87,9 +87,9 @@ def _validator(model: type[BaseModel]) -> Validator:
 class _WithDocstrings(GenerateJsonSchema):
     def model_schema(self, schema: ModelSchema) -> JsonSchemaValue:
         """Add the docstrings of a model's fields as descriptions."""
-        written, model = super().model_schema(schema), schema["cls"]
+        result, model = super().model_schema(schema), schema["cls"]
         model.model_rebuild()  # resolves aliases of classes that are defined later
-        members = written.get("properties", {})
+        members = result.get("properties", {})
         for owner in reversed(model.__mro__):
             if not issubclass(owner, BaseModel) or owner is BaseModel:
                 continue
@@ -98,7 +98,7 @@ class _WithDocstrings(GenerateJsonSchema):
                 member = members.get((field and field.alias) or name)
                 if member is not None:
                     member.setdefault("description", text)
-        return written
+        return result
 
 
 def _docstrings(owner: type) -> dict[str, str]:
@@ -120,10 +120,10 @@ def tidy(node: dict[str, Any]) -> dict[str, Any]:
     if len(branches) == 1:
         node = {**{key: value for key, value in node.items() if key != "anyOf"}, **branches[0]}
     noise = {"title", "default"} if "$ref" in node and isinstance(node.get("default"), dict) else {"title"}
-    kept = {
+    members = {
         key: value for key, value in node.items() if key not in noise and (key, value) != ("default", None)
     }
-    return {key: _tidy_member(key, value) for key, value in kept.items()}
+    return {key: _tidy_member(key, value) for key, value in members.items()}
 
 
 def _tidy_member(key: str, value: object) -> object:

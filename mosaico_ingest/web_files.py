@@ -220,12 +220,14 @@ def _properties(response: Any, where: str) -> _Properties:  # noqa: ANN401 - a r
         raise IngestError(
             "the server does not send the size of the file", where=where, hint="download the file"
         )
-    changed = headers.get("Last-Modified")
+    last_modified = headers.get("Last-Modified")
     try:
-        modified_ns = None if changed is None else int(parsedate_to_datetime(changed).timestamp()) * 10**9
+        modified_ns = (
+            None if last_modified is None else int(parsedate_to_datetime(last_modified).timestamp()) * 10**9
+        )
     except ValueError:
         modified_ns = None
-    return _Properties(int(total), modified_ns, headers.get("ETag") or changed or "")
+    return _Properties(int(total), modified_ns, headers.get("ETag") or last_modified or "")
 
 
 def _skip(response: Any, count: int) -> None:  # noqa: ANN401 - a response of urllib3

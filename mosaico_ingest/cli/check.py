@@ -106,15 +106,15 @@ def _print(one: Checked, *, show_all: bool) -> None:
             Terminal(soft_wrap=True).print(render_findings(one.findings, read_sources(one.findings)))
         return
     findings = [finding for result in one.contract.results if (finding := result.finding) is not None]
-    shown = [finding for finding in findings if show_all or finding.rule != "expectation-skipped"]
+    selected = [finding for finding in findings if show_all or finding.rule != "expectation-skipped"]
     if show_all:
         for result in one.contract.results:
             if result.finding is None:
                 Terminal(soft_wrap=True).print(
                     Text(f"passed: {result.expectation}: {result.line}", style="green")
                 )
-    if shown:
-        Terminal(soft_wrap=True).print(render_findings(shown, read_sources(shown)))
+    if selected:
+        Terminal(soft_wrap=True).print(render_findings(selected, read_sources(selected)))
         print_line("")
     print_line(_summary(one.name, one.contract), style="green" if one.contract.passed else "bold red")
 

@@ -101,11 +101,11 @@ def _choices(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, b
 def _meaning(parameter: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
     """Return the help with the default and the environment variable."""
     text = " ".join((parameter.help or "").split())
-    default, shown = parameter.default, getattr(parameter, "show_default", True)
-    if isinstance(shown, str):
-        text += f" Default: {shown}." if " " in shown else f" Default: `{shown}`."
+    default, show_default = parameter.default, getattr(parameter, "show_default", True)
+    if isinstance(show_default, str):
+        text += f" Default: {show_default}." if " " in show_default else f" Default: `{show_default}`."
     elif (
-        shown
+        show_default
         and not parameter.required
         and default not in (None, False, (), [], "")
         and not callable(default)

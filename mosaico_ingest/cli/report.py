@@ -130,7 +130,7 @@ def report(
     reports = [read_report(path) for path in paths]
     combined = reports[0].model_copy(
         update={
-            "manifests": tuple(dict.fromkeys(used for one in reports for used in one.manifests)),
+            "manifests": tuple(dict.fromkeys(manifest for one in reports for manifest in one.manifests)),
             "recordings": tuple(recording for one in reports for recording in one.recordings),
         }
     )

@@ -114,12 +114,12 @@ def lock(
             count = check_locked(manifest, jobs)
         print_line(f"{counted(count, 'recording')}: no differences", style="green")
         return
-    written = write_lock(manifest, jobs)
-    for difference in written.differences:
+    result = write_lock(manifest, jobs)
+    for difference in result.differences:
         print_line(str(difference))
-    topics = counted(len(written.lock.topics), "topic")
-    state = "" if written.is_new else f", {counted(len(written.differences), 'difference')}"
-    print_line(f"{written.path}: {topics}{state}", style="bold")
+    topics = counted(len(result.lock.topics), "topic")
+    state = "" if result.is_new else f", {counted(len(result.differences), 'difference')}"
+    print_line(f"{result.path}: {topics}{state}", style="bold")
 
 
 @contextmanager

@@ -191,9 +191,9 @@ def gc(store: StoreOption = DEFAULT_STORE) -> None:
     """Remove the files of interrupted runs. Committed sequences and active runs are not affected."""
     from mosaico_ingest.destinations.store import Store
 
-    removed = Store.open(store, create=False).collect_garbage()
-    counts = f"{counted(removed.sessions, 'abandoned session')} and {counted(removed.files, 'file')}"
-    print_line(f"removed {counts}, {bytes_text(removed.stored_bytes)}")
+    garbage = Store.open(store, create=False).collect_garbage()
+    counts = f"{counted(garbage.sessions, 'abandoned session')} and {counted(garbage.files, 'file')}"
+    print_line(f"removed {counts}, {bytes_text(garbage.stored_bytes)}")
 
 
 @store_app.command("rm")
@@ -237,9 +237,9 @@ def print_sequences(listing: Listing) -> None:
         elif summary.notes:  # `store show` prints all of them
             print_line(f"{summary.name}: {summary.notes[-1].message}", style="yellow")
     if listing.next_after is not None:
-        shown = f"{count_text(len(listing.sequences))} of {counted(listing.total, 'sequence')}"
+        position = f"{count_text(len(listing.sequences))} of {counted(listing.total, 'sequence')}"
         print_line(
-            f"{shown}; continue with --after {shlex.quote(listing.next_after)}, or list all with --limit 0"
+            f"{position}; continue with --after {shlex.quote(listing.next_after)}, or list all with --limit 0"
         )
 
 

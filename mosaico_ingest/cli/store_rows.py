@@ -356,8 +356,8 @@ def _print_gaps(timing: TopicTiming) -> None:
     if timing.timeline is None:
         return
     gaps = sorted(timing.timeline.gaps, key=lambda gap: gap.start_ns - gap.end_ns)[:MAX_GAPS]
-    shown = "" if timing.timeline.gap_count <= MAX_GAPS else f", the {MAX_GAPS} longest"
-    print_line(f"{counted(timing.timeline.gap_count, 'gap')}{shown}:", style="yellow")
+    limit = "" if timing.timeline.gap_count <= MAX_GAPS else f", the {MAX_GAPS} longest"
+    print_line(f"{counted(timing.timeline.gap_count, 'gap')}{limit}:", style="yellow")
     for gap in sorted(gaps, key=lambda gap: gap.start_ns):
         length = seconds_text((gap.end_ns - gap.start_ns) / 1e9)
         print_line(f"  {length} from {time_text(gap.start_ns)} to {time_text(gap.end_ns)}", style="yellow")

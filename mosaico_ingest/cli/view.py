@@ -73,10 +73,10 @@ def _selected(info: SequenceInfo, topics: list[str] | None) -> SequenceInfo:
     if not topics:
         return info
     names = set(select(topics, [topic.name for topic in info.topics]).selected)
-    chosen = tuple(topic for topic in info.topics if topic.name in names)
-    if not chosen:
+    matches = tuple(topic for topic in info.topics if topic.name in names)
+    if not matches:
         raise NothingMatched(f"no topic matches {', '.join(topics)}", where=info.name)
-    return replace(info, topics=chosen)
+    return replace(info, topics=matches)
 
 
 def _write_foxglove(

@@ -65,8 +65,8 @@ def combinations(document: Value) -> list[dict[str, str]]:
         count = 1
         for values in axes.values():
             count *= len(values)
-        chosen = product(*axes.values()) if axes and count <= MAX_JOBS else ()
-        cells = [variables(dict(zip(axes, values, strict=True))) for values in chosen]
+        products = product(*axes.values()) if axes and count <= MAX_JOBS else ()
+        cells = [variables(dict(zip(axes, values, strict=True))) for values in products]
     else:
         cells = []
     return cells or [{}]

@@ -113,13 +113,13 @@ def _events(header: _Row, rows: Sequence[_Row], file: str) -> EventFile:
         else:
             events.append(result)
     counts = Counter(event.name for event in events)
-    seen: set[str] = set()
+    names: set[str] = set()
     for event in events:
-        if counts[event.name] > 1 and event.name in seen:
+        if counts[event.name] > 1 and event.name in names:
             findings.append(
                 _finding(f"two events have the name {event.name!r}", event.span, "name each event once")
             )
-        seen.add(event.name)
+        names.add(event.name)
     if not rows:
         findings.append(
             _finding(f"{file} has no events", Span(file, 1, 1, 1, 1), "add a row for each sequence")

@@ -435,10 +435,10 @@ class Expectations(Section):
         expressions = dict.fromkeys(
             expression for entry in self.topics.values() for expression in entry.fields
         )
-        chosen = {
+        globs = {
             expression: first_match(
                 (glob for glob, entry in self.topics.items() if expression in entry.fields), topic
             )
             for expression in expressions
         }
-        return {expression: glob for expression, glob in chosen.items() if glob is not None}
+        return {expression: glob for expression, glob in globs.items() if glob is not None}

@@ -207,13 +207,13 @@ def replace_values(
     if not pattern:
         return change(path, value) if isinstance(value, str) else value
     children = dict(_children(value, pattern[0]))
-    changed = {
+    new_children = {
         key: replace_values(child, pattern[1:], change, (*path, key)) for key, child in children.items()
     }
-    if all(changed[key] is child for key, child in children.items()):
+    if all(new_children[key] is child for key, child in children.items()):
         return value
     if isinstance(value, BaseModel):
-        return value.model_copy(update=changed)
+        return value.model_copy(update=new_children)
     if isinstance(value, Mapping):
-        return {**value, **changed}
-    return type(value)(changed.values())
+        return {**value, **new_children}
+    return type(value)(new_children.values())

@@ -200,13 +200,13 @@ def _wrong_type(problem: _Problem, expected: str) -> Finding:
     if problem.secret:
         return problem.finding("wrong-type", f"{name} must be {expected}", "quote it")
     message = f"{name} must be {expected}, not {_kind(value)}"
-    written = _written(problem)
+    text = _written(problem)
     remedy = fix = None
     node = _node_at(problem.schema, problem.path)
-    if expected == "text" and not _fits(written, node, problem.schema):
+    if expected == "text" and not _fits(text, node, problem.schema):
         remedy = _example(problem)
-    elif expected == "text" and (_PLAIN.fullmatch(written) or _BRACED.fullmatch(written)):
-        remedy, fix = f'quote it: "{written}"', Edit(problem.span, f'"{written}"')
+    elif expected == "text" and (_PLAIN.fullmatch(text) or _BRACED.fullmatch(text)):
+        remedy, fix = f'quote it: "{text}"', Edit(problem.span, f'"{text}"')
     elif expected == "a list":
         remedy = _list_example(problem, node)
     elif expected == "a whole number" and isinstance(value, float):

@@ -418,11 +418,11 @@ class Source(Struct, frozen=True):
         """Return the span of the characters `start:end` of the text at `path`, or of the complete text if it is folded or escaped."""
         span = self.span(path)
         line = self.line(span)
-        written = line[span.column - 1 : span.end_column - 1] if span.line == span.end_line else ""
-        value = written[1:-1] if written[:1] in {'"', "'"} else written
+        text = line[span.column - 1 : span.end_column - 1] if span.line == span.end_line else ""
+        value = text[1:-1] if text[:1] in {'"', "'"} else text
         if not value or self.at(path) != value:
             return span
-        first = span.column + (len(written) - len(value)) // 2
+        first = span.column + (len(text) - len(value)) // 2
         return Span(span.file, span.line, first + start, span.line, first + end)
 
     def line(self, span: Span) -> str:

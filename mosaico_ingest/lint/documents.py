@@ -139,13 +139,13 @@ def _top_level_keys(text: str) -> Iterator[str]:
 
 def _outermost(text: str) -> str:
     """Return a text that starts with `{` without the content of inner brackets."""
-    depth, kept = 0, list[str]()
+    depth, pieces = 0, list[str]()
     for piece in re.split(r"([\[\]{}])", text):
         depth -= piece in {"]", "}"}
         if depth <= 1:
-            kept.append(piece)
+            pieces.append(piece)
         depth += piece in {"[", "{"}
-    return "".join(kept)
+    return "".join(pieces)
 
 
 def _similar(keys: Iterable[str], known: Iterable[str]) -> set[str]:

@@ -80,8 +80,8 @@ def violations(
     """
     problems = [one for one in _problems(schema, metadata, section) if not is_uncertain(one)]
     meant = {(problem.path, problem.suggestion) for problem in problems if problem.suggestion}
-    kept = [one for one in problems if not (one.is_missing and (one.path, one.key) in meant)]
-    findings = [_finding(problem, spans) for problem in kept]
+    remaining = [one for one in problems if not (one.is_missing and (one.path, one.key) in meant)]
+    findings = [_finding(problem, spans) for problem in remaining]
     start = Span("", 0, 0, 0, 0)
     return sorted(dict.fromkeys(findings), key=lambda finding: finding.span or start)
 

@@ -337,7 +337,7 @@ def replay_command(report: RunReport, one: Report) -> str | None:
     """Return the command that replays the quarantine of a recording; None if it has none."""
     if one.quarantine is None:
         return None
-    manifests = [used.path for used in report.manifests]
+    manifests = [manifest.path for manifest in report.manifests]
     job = shlex.quote(manifests[0]) if len(manifests) == 1 else "JOB.yaml"
     return f"ingest replay {shlex.quote(str(Path(one.quarantine).parent))} --manifest {job}"
 

@@ -339,8 +339,8 @@ def _field_tests(conditions_by_field: Mapping[str, Any], fields: Sequence[str], 
             for path, inner in cast("Mapping[str, Any]", conditions).items():  # keys in JSON are strings
                 tests += [(f"user_metadata.{path}", test) for test in tests_of(inner, of=path)]
         elif field in fields:
-            parsed = tests_of(conditions, of=field)
-            tests += [(field, _as_like(test) if field == "locator" else test) for test in parsed]
+            field_tests = tests_of(conditions, of=field)
+            tests += [(field, _as_like(test) if field == "locator" else test) for test in field_tests]
         else:
             text = f"a {kind} has no field {field!r}; use {', '.join(fields)} or user_metadata"
             raise Refusal(Condition.INVALID, text)

@@ -139,9 +139,9 @@ class Service(fl.FlightServerBase):
             require(context, Permission.WRITE)
             if descriptor.descriptor_type is not fl.DescriptorType.CMD:
                 raise Refusal(Condition.INVALID, "the descriptor has no command; send a command descriptor")
-            put = JSON.decode(messages.Put, descriptor.command or b"")
-            call.target = put.resource_locator
-            self._uploads.receive(put, reader.schema, self._batches(reader, call))
+            request = JSON.decode(messages.Put, descriptor.command or b"")
+            call.target = request.resource_locator
+            self._uploads.receive(request, reader.schema, self._batches(reader, call))
 
     def do_action(self, context: fl.ServerCallContext, action: fl.Action) -> Iterator[bytes]:
         """Execute an action."""

@@ -91,11 +91,11 @@ def topic_connections(
     ]
     if connections:
         return connections
-    wanted = topic or msgtype or ""
+    name = topic or msgtype or ""
     names = sorted({one.topic if topic else one.msgtype for one in recording.connections})
-    near = get_close_matches(wanted, names, n=1)
+    near = get_close_matches(name, names, n=1)
     raise NothingMatched(
-        f"no topic {'is called' if topic else 'has the type'} {wanted}",
+        f"no topic {'is called' if topic else 'has the type'} {name}",
         where=str(recording.files[0]),
         hint=f"did you mean {near[0]}?" if near else f"there are {', '.join(names) or 'none'}",
     )
@@ -231,9 +231,9 @@ def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
         spec, why = find_adapter(given), ""
         msgtype = spec.ros_types[0] if spec.ros_types else ""
     others = tuple(
-        known.name
-        for known in known_adapters(msgtype)
-        if known.name != spec.name and msgtype in known.ros_types
+        adapter.name
+        for adapter in known_adapters(msgtype)
+        if adapter.name != spec.name and msgtype in adapter.ros_types
     )
     return Explained(describe(spec, msgtype), msgtype, why, _unread(spec, msgtype, types), others)
 
@@ -274,12 +274,12 @@ def explain_topics(
 def _choices(job: Job) -> Iterator[TopicChoice]:
     plan = make_plan(Task(job))
     name = ", ".join(path.name for path in plan.files)
-    chosen = [
+    choices = [
         TopicChoice(name, one.topic, one.msgtype, one.adapter.name, one.ontology.tag, one.why)
         for one in plan.topics
     ]
-    chosen += [TopicChoice(name, one.topic, one.msgtype, "", "", one.why) for one in plan.excluded]
-    yield from sorted(chosen, key=lambda one: one.topic)
+    choices += [TopicChoice(name, one.topic, one.msgtype, "", "", one.why) for one in plan.excluded]
+    yield from sorted(choices, key=lambda one: one.topic)
 
 
 def run_adapter_tests(spec: AdapterSpec, types: DefinitionFinder) -> TestResult:

@@ -76,8 +76,7 @@ def check_sequence(
         raise ManifestError(
             "the file has no section expect", where=str(expect), hint="add the section expect"
         )
-    found = Store.open(store, create=False)
-    return Checked(sequence, check_stored(contract, found, sequence))
+    return Checked(sequence, check_stored(contract, Store.open(store, create=False), sequence))
 
 
 def _contract_job(path: Path, env: Mapping[str, str] | None) -> Job:

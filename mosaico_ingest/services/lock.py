@@ -47,15 +47,15 @@ def write_lock(manifest: Path, jobs: Sequence[Job]) -> WrittenLock:
     lock = merge_locks([(str(job.paths[0]), _lock_of(job)) for job in jobs])
     path = lock_path(manifest)
     is_new = not path.exists()
-    found: tuple[LockDifference, ...] = ()
+    differences: tuple[LockDifference, ...] = ()
     text = lock.text()
     if not is_new:
         previous = read_lock_file(manifest)
         if previous.text == text:
             return WrittenLock(path, lock, (), is_new)
-        found = lock_differences(read_lock(previous), lock)
+        differences = lock_differences(read_lock(previous), lock)
     write_atomically(path, text)
-    return WrittenLock(path, lock, found, is_new)
+    return WrittenLock(path, lock, differences, is_new)
 
 
 def check_locked(manifest: Path, jobs: Sequence[Job]) -> int:

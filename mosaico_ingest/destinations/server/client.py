@@ -214,12 +214,12 @@ class ServerClient:
         }
         with self._decoding("get_flight_info"):
             sessions = self._codec.decode(messages.SequenceInfo, _bytes(info.app_metadata) or b"{}").sessions
-            listed = (locator for session in sessions for locator in session.topics)
+            locators = (locator for session in sessions for locator in session.topics)
             return tuple(
                 about
                 if (about := described.get(locator)) and (about.user_metadata or not about.locked)
                 else self._topic_of_schema(locator, about)
-                for locator in dict.fromkeys((*described, *listed))
+                for locator in dict.fromkeys((*described, *locators))
             )
 
     def topic_schema(self, locator: str) -> pa.Schema:
@@ -430,8 +430,8 @@ def _schema_metadata(schema: pa.Schema, key: bytes = _USER_METADATA) -> dict[str
 
 
 def _layout(name: object) -> SerializationFormat:
-    known = (layout for layout in SerializationFormat if layout.value == name)
-    return next(known, SerializationFormat.DEFAULT)
+    layouts = (layout for layout in SerializationFormat if layout.value == name)
+    return next(layouts, SerializationFormat.DEFAULT)
 
 
 def _bytes(metadata: bytes | str) -> bytes:

@@ -65,13 +65,13 @@ class ServerDestination(Destination):
                 return None
             question = messages.Located(locator=sequence)
             notifications = client.act(messages.SEQUENCE_NOTIFICATION_LIST, question).notifications
-        finished = bool(info.sessions) and all(session.locked for session in info.sessions)
+        is_finished = bool(info.sessions) and all(session.locked for session in info.sessions)
         return ExistingSequence(
             name=sequence,
-            complete=finished and not notifications,
+            complete=is_finished and not notifications,
             sessions=(ExistingSession("", info.user_metadata),),
             has_all_sessions=False,
-            finished=finished,
+            finished=is_finished,
         )
 
     def open_sink(self, *, buffer_bytes: int) -> Sink:

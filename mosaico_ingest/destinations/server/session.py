@@ -160,11 +160,11 @@ class ServerSession:
             user_metadata=metadata,
         )
         created = self._client.act(messages.TOPIC_CREATE, question)
-        put = messages.Put(resource_locator=locator, topic_uuid=created.uuid)
+        request = messages.Put(resource_locator=locator, topic_uuid=created.uuid)
         upload = Upload(
             name,
             ontology,
-            lambda schema: self._client.put(put, schema),
+            lambda schema: self._client.put(request, schema),
             sizes=self._sizes,
             buffer=self._buffer,
             address=self._client.address,

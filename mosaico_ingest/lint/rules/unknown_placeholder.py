@@ -18,7 +18,7 @@ def check(job: Job) -> Iterator[Problem]:
             continue
         close = nearest(placeholder.name, PLACEHOLDERS)
         suggestion = f"did you mean {{{close}}}? " if close else ""
-        allowed = ", ".join(f"{{{known}}}" for known in PLACEHOLDERS)
+        allowed = ", ".join(f"{{{placeholder_name}}}" for placeholder_name in PLACEHOLDERS)
         span = job.source.inner_span(("sequence", "name"), placeholder.start, placeholder.end)
         message = f"unknown placeholder {name[placeholder.start : placeholder.end]}"
         yield Problem(message, span, f"{suggestion}allowed: {allowed}")
