@@ -14,13 +14,6 @@ from typing_extensions import Self
 _SIGNALS = (signal.SIGINT, signal.SIGTERM)
 
 
-class Abandoned(BaseException):
-    """Raised by an observer in a worker whose parent process is gone: the run discards its session.
-
-    It is no `Exception`, so that neither an error policy nor a handler for unexpected errors applies to it.
-    """
-
-
 @contextmanager
 def count_interrupts() -> Generator[list[int]]:
     """Yield a list that collects the numbers of SIGINT and SIGTERM instead of letting them raise.

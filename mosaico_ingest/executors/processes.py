@@ -22,7 +22,7 @@ from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_ope
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.base import do_nothing
 from mosaico_ingest.executors.batch import Batch, Registrations
-from mosaico_ingest.interrupts import Abandoned, StopHandler, count_interrupts
+from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.run import failed_report, run_recording
@@ -193,10 +193,7 @@ def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], N
     pa.set_cpu_count(max(1, (os.cpu_count() or 1) // processes))
     prepare()
     registrations.register()
-    with (
-        keep_destinations_open() as keep_open,
-        suppress(Abandoned, EOFError, BrokenPipeError, ConnectionResetError),
-    ):
+    with keep_destinations_open() as keep_open, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while not stop.requested:
             _run_job(pipe, pipe.recv_bytes(), stop, keep_open)
 
@@ -205,11 +202,7 @@ def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: Kee
     def tell(event: Event) -> None:
         stop.disable()  # an interrupt in the middle of a message would leave half of it in the pipe
         # `pipe.send` would leave a view of a BytesIO in the traceback, whose collection crashes CPython before 3.12.3.
-        pickled_event = pickle.dumps(event)
-        try:
-            pipe.send_bytes(pickled_event)
-        except OSError as error:  # the parent is gone, so the result has no reader
-            raise Abandoned from error
+        pipe.send_bytes(pickle.dumps(event))
         stop.enable()
 
     try:

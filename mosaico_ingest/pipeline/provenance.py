@@ -109,8 +109,6 @@ class SequenceRequest(Struct, frozen=True):
     if_exists: IfExists
     quarantine_file: str | None = None
     """The name of the quarantine file in the provenance record."""
-    replaces_stored: bool = False
-    """True if the commit swaps a stored sequence for the new one: an incomplete result must not replace it."""
 
 
 def content_digest(path: Path, size_bytes: int | None = None) -> str:
@@ -159,11 +157,8 @@ def check_provenance(plan: Plan, fingerprint: str | None = None) -> SequenceRequ
     if_exists = plan.sequence.if_exists
     if plan.attempt is not None and plan.attempt.number > 1:
         if_exists = _remove_earlier_attempt(plan, plan.attempt.run)
-    destination = destination_of(plan.destination)
-    needed = if_exists is not IfExists.APPEND and (
-        if_exists is not IfExists.REPLACE or destination.replaces_atomically
-    )
-    stored = stored_provenance(plan.destination, plan.sequence.name) if needed else None
+    is_compared = if_exists in {IfExists.FAIL, IfExists.SKIP}
+    stored = stored_provenance(plan.destination, plan.sequence.name) if is_compared else None
     provenance = add_doubtful_digests(provenance, plan.files, stored)
     if if_exists is IfExists.SKIP:
         decision = decide_skip(provenance, stored, files=plan.files, sequence=plan.sequence.name)
@@ -185,9 +180,6 @@ def check_provenance(plan: Plan, fingerprint: str | None = None) -> SequenceRequ
         },
         if_exists=if_exists,
         quarantine_file=quarantine_file,
-        replaces_stored=stored is not None
-        and if_exists is IfExists.REPLACE
-        and destination.replaces_atomically,
     )
 
 

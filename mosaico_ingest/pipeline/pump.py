@@ -13,7 +13,7 @@ from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, Store
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import EmptyPart, IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
-from mosaico_ingest.interrupts import Abandoned, DeferredInterrupt
+from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
 from mosaico_ingest.pipeline.attachments import attach_files
 from mosaico_ingest.pipeline.latched import latched_blocks
@@ -69,9 +69,11 @@ def write_sequence(
 ) -> Written:
     """Pump every message of the plan into the sink and commit, or discard as the session policy demands.
 
+    `CommitStarted` precedes every commit: an observer that raises, such as that of a worker whose parent process is gone,
+    discards the session.
+
     Raises:
         IngestError: The run ended early and its session was discarded.
-        Abandoned: The observer is gone; the session was discarded.
     """
     topics: tuple[TopicPipeline, ...] = ()
     missing: list[str] = []
@@ -370,11 +372,9 @@ def _nothing_matched(plan: Plan, what: str) -> NothingMatched:
 def _keeps_partial(plan: Plan, request: SequenceRequest, failure: BaseException, *, rows: int) -> bool:
     """Return whether the rows that the destination accepted before an error are committed; without rows, nothing is.
 
-    A partial result never replaces a stored sequence. A stopped `append` is discarded, so that repeating the command
-    does not append the same rows twice.
+    The sink refuses a partial result that would replace a stored sequence; see `Session.note_error`. A stopped `append`
+    is discarded, so that repeating the command does not append the same rows twice.
     """
-    if isinstance(failure, Abandoned) or request.replaces_stored:
-        return False
     if plan.contract is not None and plan.contract.expect.on_failure is not OnFailure.WARN:
         return False  # an incomplete recording cannot fulfill its contract
     if isinstance(failure, Interrupted) and request.if_exists is IfExists.APPEND:
@@ -397,8 +397,6 @@ def _discard(
     """Discard the quarantine and account for the rows of a session that was discarded."""
     if quarantine is not None:
         quarantine.discard()
-    if isinstance(error, Abandoned):
-        return
     cause = error.what if isinstance(error, IngestError) else str(error)
     for topic in topics:
         _subtract(topic, 0, f"the session was discarded: {cause}", observe)

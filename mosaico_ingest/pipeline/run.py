@@ -61,8 +61,7 @@ class Outcome(Struct, frozen=True):
 def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     """Ingest one recording, or plan it if the task is a dry run; every error, expected or not, is part of the outcome.
 
-    Raises:
-        Abandoned: The observer is gone; the session was discarded.
+    Only errors of the observer are raised.
     """
     job = task.job
     events = _RunEvents(task, observe)

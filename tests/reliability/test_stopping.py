@@ -5,14 +5,12 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Callable
-from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.interrupts import Abandoned
 from mosaico_ingest.report.events import CommitStarted, Event, RunStatus, TopicProgress
 from mosaico_ingest.report.model import Report
 
@@ -21,8 +19,8 @@ from .conftest import CUT, RunJob, WriteBag, number
 WriteJob = Callable[..., Path]
 
 
-def stop_after_rows(job: Path, error: type[BaseException] = KeyboardInterrupt) -> Report:
-    """Run a job whose observer raises when the second batch of rows is counted."""
+def stop_after_rows(job: Path) -> Report:
+    """Interrupt a job when the second batch of rows is counted."""
     batches = 0
 
     def stop(_position: int, event: Event) -> None:
@@ -30,7 +28,7 @@ def stop_after_rows(job: Path, error: type[BaseException] = KeyboardInterrupt) -
         if isinstance(event, TopicProgress) and event.written > 0:
             batches += 1
             if batches == 2:
-                raise error
+                raise KeyboardInterrupt
 
     (report,) = api.run(api.compile_job(job), observe=stop).recordings
     assert batches >= 2
@@ -93,15 +91,6 @@ def test_run_of_other_job_after_interrupt_fails(
     assert rows(tmp_path) == before
 
 
-def test_run_abandoned_by_observer_discards_session(
-    write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
-) -> None:
-    write_bag({"/speed": [number(1)] * 70_000})
-    with pytest.raises(Abandoned):
-        stop_after_rows(write_job(), Abandoned)
-    assert rows(tmp_path) == 0
-
-
 @pytest.mark.parametrize("if_exists", ["fail", "replace"])
 def test_run_interrupted_before_first_row_is_written_publishes_nothing(
     if_exists: str, write_bag: WriteBag, write_job: WriteJob, run_job: RunJob, tmp_path: Path
@@ -123,20 +112,27 @@ def test_run_interrupted_before_first_row_is_written_publishes_nothing(
     )
 
 
-@pytest.mark.parametrize("on_error", ["report", "delete"])
+@pytest.mark.parametrize("lost_at", [TopicProgress, CommitStarted])
 @pytest.mark.parametrize(
     "payloads", [[number(1)] * 10, [number(1)] * 70_000 + [CUT]], ids=["complete", "failed"]
 )
-def test_run_abandoned_at_commit_publishes_nothing(
-    payloads: list[bytes], on_error: str, write_bag: WriteBag, write_job: WriteJob, tmp_path: Path
+def test_run_that_loses_its_observer_publishes_nothing(
+    payloads: list[bytes],
+    lost_at: type[Event],
+    write_bag: WriteBag,
+    write_job: WriteJob,
+    tmp_path: Path,
 ) -> None:
     def stop(_position: int, event: Event) -> None:
-        if isinstance(event, CommitStarted):
-            raise Abandoned
+        nonlocal is_lost
+        is_lost = is_lost or isinstance(event, lost_at)
+        if is_lost:
+            raise BrokenPipeError
 
+    is_lost = False
     write_bag({"/speed": payloads})
-    job = write_job(on_error={"session": on_error, "message": "raise"})
-    with suppress(Abandoned):
+    job = write_job(on_error={"session": "report", "message": "raise"})
+    with pytest.raises(BrokenPipeError):
         api.run(api.compile_job(job), observe=stop)
     assert Store.open(tmp_path / "store").names() == ()
 
