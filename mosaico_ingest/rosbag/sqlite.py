@@ -87,6 +87,8 @@ class SqliteReader:
             self._stack.close()
             raise
         self.message_count: int | None = None if self._counts is None else self._totals.table_rows
+        if self._totals.damage is not None:
+            self.notes.append(f"the file is damaged and read row by row: {self._totals.damage}")
         described = {connection.id for connection in self.connections}
         self.unreadable += undescribed_connections(self._counts, described)
         if self._counts is not None and self._totals.untyped_rows:
