@@ -11,6 +11,7 @@ from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
 from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
@@ -19,7 +20,7 @@ from mosaico_ingest.job.image import image_settings
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.patterns import Selection, first_match, select
 from mosaico_ingest.job.units import format_time
-from mosaico_ingest.job.values import LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
+from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
 from mosaico_ingest.pipeline.attachments import kept_content
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
@@ -83,6 +84,7 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     findings += _image_settings(job, topics)
     findings += _missing_publish_times(job, recording, topics)
     findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
+    findings += _interrupted_replacement(job)
     content = kept_content(job, recording)
     findings += content.findings
     plan = Plan(
@@ -135,6 +137,20 @@ def _group_findings(job: Job, recording: Recording) -> Iterator[Finding]:
             "set bag.group: none if every file is a recording",
         )
     yield from numbering_gaps(recording.files, number_of, from_zero=len(job.paths) == 1)
+
+
+def _interrupted_replacement(job: Job) -> Iterator[Finding]:
+    """Yield a finding if readers do not see the sequence while it is replaced."""
+    destination = destination_of(job.destination)
+    if job.sequence.if_exists is IfExists.REPLACE and not destination.replaces_atomically:
+        yield Finding(
+            "replaced-by-deletion",
+            Severity.INFO,
+            f"{destination.describe()} cannot swap sequences: if {job.sequence.name} exists, it is deleted before the"
+            " new sequence is uploaded",
+            job.span("sequence", "if_exists"),
+            "if readers must always see one of the two, upload under another name and delete the old sequence afterwards",
+        )
 
 
 def _with_metadata(job: Job, recording: Recording) -> tuple[Job, tuple[Finding, ...]]:

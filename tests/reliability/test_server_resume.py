@@ -19,6 +19,7 @@ from typing import Any
 import pytest
 from mosaicod import Proxy
 
+from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 
 from .conftest import WriteBag, number
@@ -104,7 +105,12 @@ def test_changed_content_is_refused_by_skip_and_replaced_by_replace(
     assert "made from other content (drive.db3)" in " ".join(output.split())
     assert speeds(tmp_path) == [1]
     write_job(sequence={**SKIP, "if_exists": "replace"}, **to(port))
-    assert ran("run", job)[0] == 0
+    (plan,) = api.plan_job(job).recordings
+    rule = "replaced-by-deletion"
+    assert [(note.rule, note.location is None) for note in plan.notes if note.rule == rule] == [(rule, False)]
+    (report,) = api.run(api.compile_job(job)).recordings
+    assert report.exit_code == 0
+    assert len([finding for finding in report.findings if f"[{rule}]" in finding]) == 1
     assert speeds(tmp_path) == [2]
     write_job(sequence=SKIP, **to(port))
     assert ran("run", job)[0] == 0
