@@ -10,6 +10,7 @@ from typing import Any
 
 from mosaico_ingest.adapters.builtin import CATALOG, CATALOG_FILE, Builtin, builtins_of, find_builtin
 from mosaico_ingest.adapters.mapping.loader import load_adapter
+from mosaico_ingest.rosbag.definitions.model import group_types
 
 _BEGIN, _END = "<!-- catalog: generated from its files -->\n", "<!-- end of catalog -->\n"
 
@@ -55,19 +56,10 @@ def _tables(builtins: Sequence[Builtin]) -> str:
 
 def _table(builtins: Sequence[Builtin]) -> str:
     rows = "".join(
-        f"| `{builtin.name}` | {_grouped(builtin.ros_types)} | `{builtin.tag}` | {builtin.description} |\n"
+        f"| `{builtin.name}` | {group_types(builtin.ros_types)} | `{builtin.tag}` | {builtin.description} |\n"
         for builtin in builtins
     )
     return f"| adapter | ROS types | ontology | |\n|---|---|---|---|\n{rows}"
-
-
-def _grouped(names: Sequence[str]) -> str:
-    """Return type names grouped by package, such as `sensor_msgs: Imu`."""
-    packages: dict[str, list[str]] = {}
-    for name in names:
-        package, _, short = name.partition("/msg/")
-        packages.setdefault(package, []).append(short)
-    return "; ".join(f"{package}: {', '.join(shorts)}" for package, shorts in packages.items())
 
 
 if __name__ == "__main__":

@@ -71,10 +71,12 @@ def list_adapters(
 
 def print_adapters(adapters: Sequence[Known]) -> None:
     """Print a row for each adapter, dimmed if only an override can choose it."""
+    from mosaico_ingest.rosbag.definitions.model import group_types
+
     table = PlainTable("adapter", "ontology", "takes", "from")
     for adapter in adapters:
         origin = adapter.origin if adapter.default else f"{adapter.origin}, by override"
-        types = _types_text(adapter.ros_types)
+        types = group_types(adapter.ros_types)
         table.add_row(adapter.name, adapter.ontology, types, origin, style=None if adapter.default else "dim")
     Terminal().print(table)
 
@@ -247,6 +249,8 @@ def run_tests(
 
 def print_test_results(results: Sequence[TestResult]) -> None:
     """Print findings, failed tests, and the number of tests that passed."""
+    from mosaico_ingest.rosbag.definitions.model import group_types
+
     for result in results:
         _print_test_result(result)
     outcomes = [outcome for result in results for outcome in result.outcomes]
@@ -257,7 +261,7 @@ def print_test_results(results: Sequence[TestResult]) -> None:
     print_line(line, style="green" if all(result.passed for result in results) else "bold red")
     unknown = [name for result in results for name in result.unknown]
     if unknown:
-        types = _types_text(unknown)
+        types = group_types(unknown)
         print_line(f"not checked against {types}: the definition is unknown; give --msg-dir", style="yellow")
 
 
@@ -348,13 +352,6 @@ def _packages(msg_dirs: list[str] | None) -> list[tuple[str, Path, None]]:
         default = path.resolve().parent.name if path.name == "msg" else path.resolve().name
         packages.append((package if equals else default, path, None))
     return packages
-
-
-def _types_text(names: Sequence[str]) -> str:
-    """Return types grouped by package, such as `sensor_msgs: Image, Imu`."""
-    pairs = sorted((name.partition("/")[0], name.rpartition("/")[2]) for name in names)
-    packages = groupby(pairs, key=lambda pair: pair[0])
-    return "; ".join(f"{package}: {', '.join(name for _, name in types)}" for package, types in packages)
 
 
 def _result_json(result: TestResult) -> dict[str, Any]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Generator, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from os.path import relpath
@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import AdapterSpec, Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
-from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME, Builtin
+from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
 from mosaico_ingest.adapters.draft import RecordedExample, draft
 from mosaico_ingest.adapters.explain import Description, describe, unread_fields
 from mosaico_ingest.adapters.mapping.model import RecordedMessage
@@ -217,18 +217,18 @@ def source_text(spec: AdapterSpec) -> str:
     return mapping.source.text
 
 
-def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
+def explain_adapter(reference: str, types: DefinitionFinder) -> Explained:
     """Explain an adapter, or the default adapter of a message type.
 
     Raises:
         AdapterError: There is no such adapter, or a type without one.
     """
-    if _is_type(given):
-        msgtype = normalize_msgtype(given)
+    if _is_type(reference):
+        msgtype = normalize_msgtype(reference)
         choice = ROSBridge().resolve("", msgtype)
         spec, why = choice.spec, choice.why
     else:
-        spec, why = find_adapter(given), ""
+        spec, why = find_adapter(reference), ""
         msgtype = spec.ros_types[0] if spec.ros_types else ""
     others = tuple(
         adapter.name
@@ -238,19 +238,26 @@ def explain_adapter(given: str, types: DefinitionFinder) -> Explained:
     return Explained(describe(spec, msgtype), msgtype, why, _unread(spec, msgtype, types), others)
 
 
-def _is_type(given: str) -> bool:
-    return given not in BY_NAME and "/" in given and ":" not in given and not Path(given).suffix
+_FILES = (".py", ".yaml", ".yml")
+
+
+def _is_type(reference: str) -> bool:
+    """Return whether a reference is a type, such as `sensor_msgs/Imu` or `foxglove.Log`, and not an adapter."""
+    is_name = ":" not in reference and not reference.endswith(_FILES)
+    return is_name and ("/" in reference or "." in reference)
 
 
 def _unread(spec: AdapterSpec, msgtype: str, types: DefinitionFinder) -> tuple[str, ...]:
-    if not msgtype:
-        return ()
-    try:
-        definition = types.find(msgtype, spec)
-    except BagError:
-        return ()
-    shape = ros_shape(definition)
-    return unread_fields(spec.bind(definition, shape), shape)
+    """Return the fields of a type that an adapter does not read.
+
+    A protobuf or JSON type is in no distro; it has the fields of the adapter's first type.
+    """
+    for name in (msgtype, *spec.ros_types[:1]):
+        with suppress(BagError):
+            definition = types.find(name, spec)
+            shape = ros_shape(definition)
+            return unread_fields(spec.bind(definition, shape), shape)
+    return ()
 
 
 def explain_topics(

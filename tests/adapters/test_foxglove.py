@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
-from foxglove_schemas import MESSAGES, json_definition, json_payload, protobuf_definition, protobuf_payload
+from foxglove_schemas import (
+    MESSAGES,
+    json_definition,
+    json_payload,
+    protobuf_definition,
+    protobuf_payload,
+    ros_form,
+)
 from protobuf_schemas import definition_of, proto3_file
 
 from mosaico_ingest.adapters.adapter import AdapterSpec, Envelope
-from mosaico_ingest.adapters.builtin import BUILTIN, BY_TYPE
+from mosaico_ingest.adapters.builtin import BUILTIN, BY_TYPE, find_builtin
 from mosaico_ingest.adapters.draft import draft
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
@@ -37,19 +46,33 @@ def row_of(name: str, definition: Definition, message: dict[str, Any]) -> dict[s
 def test_foxglove_message_becomes_the_same_row_in_every_form(
     name: str, define: Callable[..., Definition]
 ) -> None:
-    message = MESSAGES[name]
-    ros = define(f"foxglove_msgs/msg/{name}")
-    proto, text = protobuf_definition(name), json_definition(name)
-    expected = row_of(name, ros, message)
+    msgtype, ros_message = ros_form(name)
+    proto, text, message = protobuf_definition(name), json_definition(name), MESSAGES[name]
+    expected = row_of(name, define(msgtype), ros_message)
     assert row_of(name, proto, ProtobufCodec(proto).to_dict(protobuf_payload(name, message))) == expected
     assert row_of(name, text, JsonCodec(text).to_dict(json_payload(message))) == expected
 
 
-def test_foxglove_types_whose_fields_have_columns_have_a_default_adapter() -> None:
-    without_default = {"JointStates", "Log"}
-    names = MESSAGES.keys() - without_default
-    assert all(f"foxglove.{name}" in BY_TYPE and f"foxglove_msgs/msg/{name}" in BY_TYPE for name in names)
-    assert not [name for name in without_default if f"foxglove.{name}" in BY_TYPE]
+def test_foxglove_types_have_a_default_adapter_except_log() -> None:
+    names = MESSAGES.keys() - {"Log"}
+    assert all(f"foxglove.{name}" in BY_TYPE and ros_form(name)[0] in BY_TYPE for name in names)
+    assert "foxglove.Log" not in BY_TYPE
+    assert "foxglove_msgs/msg/Log" not in BY_TYPE
+
+
+@pytest.mark.parametrize("form", ["protobuf", "json"])
+def test_foxglove_location_fix_of_an_older_version_has_no_velocity(form: str) -> None:
+    fields = ("timestamp", "frame_id", "latitude", "longitude", "altitude")
+    fields += ("position_covariance", "position_covariance_type")
+    message = {name: MESSAGES["LocationFix"][name] for name in fields}
+    if form == "json":
+        definition = json_definition("LocationFix", message)
+        values = JsonCodec(definition).to_dict(json_payload(message))
+    else:
+        definition = protobuf_definition("LocationFix")
+        values = ProtobufCodec(definition).to_dict(protobuf_payload("LocationFix", message))
+    row = row_of("LocationFix", definition, values)
+    assert (row["position"]["x"], row["velocity"]) == (45.5, None)
 
 
 def test_foxglove_values_that_are_absent_are_nan() -> None:
@@ -88,7 +111,7 @@ def test_foxglove_absent_time_is_null_and_partial_time_is_rejected() -> None:
 @pytest.mark.parametrize("definition", [protobuf_definition("PointCloud"), json_definition("PointCloud")])
 def test_draft_of_protobuf_and_json_types_binds(definition: Definition) -> None:
     text = draft(definition)
-    spec = load_adapter(text)
+    spec = load_adapter(text, adapters=find_builtin)
     assert spec.check(definition, ros_shape(definition)) == ()
     assert "ros_type: foxglove.PointCloud" in text
     assert "definition:" not in text
@@ -97,3 +120,20 @@ def test_draft_of_protobuf_and_json_types_binds(definition: Definition) -> None:
 def test_draft_of_all_protobuf_features_binds() -> None:
     definition = definition_of(proto3_file(), "all.Message")
     assert load_adapter(draft(definition)).check(definition, ros_shape(definition)) == ()
+
+
+def test_page_lists_the_ontology_type_of_every_foxglove_schema() -> None:
+    page = (Path(__file__).parents[2] / "docs" / "encodings.md").read_text()
+    mapped, unmodeled = (
+        page.split("## Foxglove schemas")[1].split("## Protobuf")[0].split("Without an adapter")
+    )
+    for row in re.findall(r"^\| (`.*) \| `(\w+)` \|", mapped, re.MULTILINE):
+        for name in re.findall(r"`(\w+)`", row[0]):
+            assert BY_TYPE[f"foxglove.{name}"].tag == row[1]
+            assert name in MESSAGES
+    names = set(re.findall(r"`(\w+)`", mapped)) | set(re.findall(r"`(\w+)`", unmodeled))
+    assert names >= MESSAGES.keys()
+    rows = re.findall(r"^\| (`.*?) \|", unmodeled, re.MULTILINE)
+    unadapted = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(unadapted) > 20
+    assert not [name for name in unadapted if f"foxglove.{name}" in BY_TYPE]

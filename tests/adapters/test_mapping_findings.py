@@ -197,6 +197,12 @@ def test_adapter_file_mistake_with_known_remedy_suggests_it(
     assert finding.help.startswith(hint)
 
 
+@pytest.mark.parametrize("body", ["ontology:\nfields: {data: data}\n", "ontology: Point3d\nfields:\n"])
+def test_required_key_without_a_value_is_missing(body: str) -> None:
+    [(finding, under)] = findings_of(f"version: 1\nadapter: A\nros_type: a_msgs/msg/B\n{body}")
+    assert (finding.rule, under) == ("missing-key", "adapter")
+
+
 def test_struct_written_as_plain_mapping_suggests_fields() -> None:
     [(finding, _)] = findings_of(f"{FILE}  point: {{x: soc}}\n")
     assert finding.help is not None

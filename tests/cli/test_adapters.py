@@ -107,6 +107,13 @@ def test_explain_type_explains_its_default_adapter(ingest: Ingest) -> None:
     assert "Unmodeled" in ingest("explain", "std_msgs/msg/ColorRGBA")[1]
 
 
+def test_explain_protobuf_type_explains_its_default_adapter(ingest: Ingest) -> None:
+    output = json.loads(ingest("explain", "foxglove.LocationFix", "--json")[1])
+    assert output["why"] == "built-in for foxglove.LocationFix"
+    assert output["unread"] == ["heading"]
+    assert "Unmodeled" in ingest("explain", "acme.Speed")[1]
+
+
 def test_explain_variant_type_lists_its_additional_columns(ingest: Ingest) -> None:
     output = json.loads(ingest("explain", "geometry_msgs/msg/PoseStamped", "--json")[1])
     origins = {column["name"]: column["origin"] for column in output["description"]["columns"]}

@@ -48,6 +48,10 @@ MESSAGES: dict[str, dict[str, Any]] = {
         "altitude": 100.0,
         "position_covariance": [1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 4.0],
         "position_covariance_type": 2,
+        "heading": 0.25,
+        "velocity": {"x": 1.0, "y": 2.0, "z": 3.0},
+        "color": {"r": 0.0, "g": 0.5, "b": 1.0, "a": 1.0},
+        "metadata": [{"key": "k", "value": "v"}],
     },
     "FrameTransform": _TRANSFORM,
     "FrameTransforms": {"transforms": [_TRANSFORM, {**_TRANSFORM, "child_frame_id": "base"}]},
@@ -85,8 +89,24 @@ MESSAGES: dict[str, dict[str, Any]] = {
         "file": "f",
         "line": 3,
     },
+    "Point2": {"x": 1.0, "y": 2.0},
+    "Vector2": {"x": 1.0, "y": 2.0},
+    "Point3": _POSE["position"],
+    "Point3InFrame": {**_HEAD, "point": _POSE["position"]},
+    "Vector3": _POSE["position"],
+    "Quaternion": _POSE["orientation"],
+    "Pose": _POSE,
 }
-"""One message per schema, in the form of ROS 2."""
+"""One message per schema, with the field names of ROS 2."""
+
+_GEOMETRY = {
+    "Point3": "Point",
+    "Point3InFrame": "PointStamped",
+    "Vector3": "Vector3",
+    "Quaternion": "Quaternion",
+    "Pose": "Pose",
+}
+"""Schemas whose ROS 2 form is a type of geometry_msgs."""
 
 _NESTED = {
     "pose": "Pose",
@@ -98,6 +118,9 @@ _NESTED = {
     "transforms": "FrameTransform",
     "fields": "PackedElementField",
     "joints": "JointState",
+    "point": "Point3",
+    "velocity": "Vector3",
+    "color": "Color",
     "linear_velocity": "Vector3",
     "angular_velocity": "Vector3",
     "metadata": "KeyValuePair",
@@ -107,6 +130,18 @@ _UPPER = {"d": "D", "k": "K", "r": "R", "p": "P"}
 """Names that are upper case in protobuf and JSON, where ROS 2 requires lower case."""
 
 
+def ros_form(name: str) -> tuple[str, dict[str, Any]]:
+    """Return the type and the message of a schema in ROS 2."""
+    message = MESSAGES[name]
+    if name == "Point3InFrame":
+        message = {
+            "header": {"stamp": message["timestamp"], "frame_id": message["frame_id"]},
+            "point": message["point"],
+        }
+    geometry = _GEOMETRY.get(name)
+    return f"geometry_msgs/msg/{geometry}" if geometry else f"foxglove_msgs/msg/{name}", message
+
+
 def protobuf_definition(name: str) -> Definition:
     """Return the protobuf form of a schema."""
     return protobuf.read_schema(
@@ -114,9 +149,9 @@ def protobuf_definition(name: str) -> Definition:
     )
 
 
-def json_definition(name: str) -> Definition:
-    """Return the JSON form of a schema."""
-    schema = json.dumps(_json_schema(f"foxglove.{name}", MESSAGES[name]))
+def json_definition(name: str, example: Mapping[str, Any] | None = None) -> Definition:
+    """Return the JSON form of a schema with the fields of an example, by default of the one in `MESSAGES`."""
+    schema = json.dumps(_json_schema(f"foxglove.{name}", example or MESSAGES[name]))
     return json_schema.read_schema(f"foxglove.{name}", Embedded("jsonschema", schema))
 
 

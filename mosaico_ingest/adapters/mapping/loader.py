@@ -425,8 +425,8 @@ def _check_keys(model: MappingFile, analyzer: Analyzer) -> None:
     keys = model.model_fields_set
     single = ("ontology", "fields", "rows", "schema_metadata")
     if model.outputs is None:
-        for key in ("ontology", "fields"):
-            if key not in keys:
+        for key, value in (("ontology", model.ontology), ("fields", model.fields)):
+            if value is None:
                 message = f"the adapter needs the key {key!r}"
                 analyzer.report(("adapter",), message, f"add {key}:, or outputs:", rule="missing-key")
         return _check_names(model, analyzer)

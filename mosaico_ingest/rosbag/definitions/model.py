@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from enum import Enum
 from typing import Protocol
 
@@ -36,6 +36,15 @@ def normalize_msgtype(name: str) -> str:
         parts.insert(-1, "msg")
     full = "/".join(parts)
     return _RENAMED.get(full, full)
+
+
+def group_types(names: Iterable[str]) -> str:
+    """Return type names grouped by package, such as `sensor_msgs: Image, Imu; foxglove: Log`."""
+    packages: dict[str, list[str]] = {}
+    for name in names:
+        package, _, short = name.rpartition("/" if "/" in name else ".")
+        packages.setdefault(package.partition("/")[0], []).append(short)
+    return "; ".join(f"{package}: {', '.join(shorts)}" for package, shorts in packages.items())
 
 
 def short_msgtype(name: str) -> str:
