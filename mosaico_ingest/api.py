@@ -22,8 +22,6 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.pipeline.plan import digest_of
-from mosaico_ingest.pipeline.run import make_plan, run_recording
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
@@ -72,6 +70,8 @@ class RosbagInjector:
         Raises:
             IngestError: The configuration does not fit the recording.
         """
+        from mosaico_ingest.pipeline.run import make_plan
+
         return make_plan(Task(self._config.job))
 
     def run(self) -> Report:
@@ -83,6 +83,8 @@ class RosbagInjector:
             ManifestError: The configuration splits the recording into several sequences.
             IngestError: The run failed or was interrupted. The session policy decides which rows were kept.
         """
+        from mosaico_ingest.pipeline.run import run_recording
+
         if self._config.job.split is not None:
             raise ManifestError(
                 "split makes several sequences", where="manifest['split']", hint="use api.run([config])"
@@ -102,11 +104,14 @@ def compile_job(manifest: Path, *, locked: bool = True) -> tuple[Job, ...]:
         AdapterError: An adapter of the manifest does not exist or has a mistake.
     """
     from mosaico_ingest.job.manifest import load_manifests
-    from mosaico_ingest.pipeline.compile import check_adapters, compile_manifests
+    from mosaico_ingest.pipeline.compile import compile_manifests
 
     jobs = compile_manifests(load_manifests(manifest), locked=locked)
-    for _, group in groupby(jobs, key=lambda job: job.adapters):
-        check_adapters(next(group))
+    for adapters, group in groupby(jobs, key=lambda job: job.adapters):
+        if adapters.load or adapters.override:
+            from mosaico_ingest.pipeline.adapter_check import check_adapters
+
+            check_adapters(next(group))
     return jobs
 
 
@@ -264,6 +269,7 @@ def compile_plan(path: Path) -> tuple[Task, ...]:
         ManifestError: The file is not a plan, or its manifest has mistakes.
         IngestError: The manifest or a recording no longer fits the plan; `findings` has the differences.
     """
+    from mosaico_ingest.pipeline.plan import digest_of
     from mosaico_ingest.pipeline.plan_document import differences, read_plan
     from mosaico_ingest.pipeline.preview import decide
 

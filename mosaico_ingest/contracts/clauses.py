@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
@@ -19,10 +19,20 @@ from mosaico_ingest.job.expect import (
     TopicExpectations,
 )
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
 
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.types import OntologyType
+
 KeyPath = tuple[str | int, ...]
+TIME_KEYS = frozenset({"rate", "sliding_rate", "gap", "gaps", "messages", "coverage", "start", "end"})
+"""Expectations of log times."""
+HEADER_KEYS = frozenset({"latency", "stamps", "frame_id", "sequence_numbers"})
+"""Expectations that need the header of messages."""
+ROW_KEYS = HEADER_KEYS | {"rejected"}
+"""Expectations of a topic, except `fields`, that need decoded messages."""
+ORDER_KEYS = frozenset({"out_of_order", "sequence_numbers"})
+"""Expectations of the order of messages in the files."""
 
 _LISTS = {"type": AllowedNames, "frame_id": AllowedNames}
 _LIMITS = frozenset({"rejected", "out_of_order", "unreadable"})

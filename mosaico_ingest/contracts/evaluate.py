@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from mosaico_ingest.contracts import texts
-from mosaico_ingest.contracts.clauses import Clause, Contract, occurrence
-from mosaico_ingest.contracts.monitor import HEADER_KEYS, TopicMonitor
+from mosaico_ingest.contracts.clauses import HEADER_KEYS, Clause, Contract, occurrence
+from mosaico_ingest.contracts.monitor import TopicMonitor
 from mosaico_ingest.contracts.order import FileOrder
 from mosaico_ingest.contracts.recorder import RecorderEvents, Windows, covered_ns, uncovered_ns
 from mosaico_ingest.contracts.row_results import field_result, header_result

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,9 +17,12 @@ from mosaico_ingest.adapters.mapping.columns import Array, Axis, arrays, null_ma
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
 from mosaico_ingest.adapters.mapping.types import ExprType, format_type, is_list, is_number
+from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.expect import FieldExpectations
-from mosaico_ingest.rosbag.definitions.model import MessageType
+from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.rosbag.definitions.model import Definition, MessageType
 
 NUMERIC = frozenset({"between", "min", "max", "finite", "mean", "std", "change"})
 """Expectations that require numbers."""
@@ -60,19 +62,14 @@ class FieldExpression(Struct, frozen=True):
         return not self.typed.type.axes
 
 
-class Values(Struct, frozen=True):
-    """The values of an expression over a batch of rows."""
+def message_rows(definition: Definition) -> Rows:
+    """Return the rows of messages in the ROS shape."""
+    return Rows(ros_shape(definition), definition.types, definition.root, definition.root)
 
-    data: NDArray[Any]
-    """The values, with zero or an empty text in place of null, shape (n,)."""
-    null: NDArray[np.bool_] | None
-    """Where the values are null; None if no value is null."""
-    rows: NDArray[np.int64] | None
-    """The row of each value; None for one value per row."""
 
-    def row(self, position: int) -> int:
-        """Return the row of a value."""
-        return position if self.rows is None else int(self.rows[position])
+def ontology_rows(ontology: OntologyType) -> Rows:
+    """Return the rows of an ontology type."""
+    return Rows(ontology.struct, {}, None, ontology.tag)
 
 
 def locator(span: Span | None, text: str) -> Locate:

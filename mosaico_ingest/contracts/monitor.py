@@ -3,160 +3,21 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct
-from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.columns import Array
-from mosaico_ingest.contracts.clauses import Clause, Contract
-from mosaico_ingest.contracts.expressions import (
-    Evaluator,
-    FieldExpression,
-    Rows,
-    Values,
-    bind_expression,
-    locator,
-    type_findings,
-)
+from mosaico_ingest.contracts.clauses import ORDER_KEYS, ROW_KEYS, Clause, Contract
 from mosaico_ingest.contracts.order import FileOrder
 from mosaico_ingest.contracts.times import Gaps, Int64s, SlidingWindow, TopicTimes
-from mosaico_ingest.contracts.values import (
-    Accumulator,
-    AllowedTexts,
-    AllowedValues,
-    Batch,
-    Changes,
-    FiniteNumbers,
-    LatencyRange,
-    MissingNumbers,
-    Moments,
-    Nulls,
-    NumberLimits,
-    Steps,
-    Unchanged,
-    frames_of,
-    header_numbers_of,
-    ontology_stamps_of,
-    stamps_of,
-)
-from mosaico_ingest.findings import Finding
+from mosaico_ingest.contracts.values import Batch
 from mosaico_ingest.job.values import RECORDING, Interval
 
-TIME_KEYS = frozenset({"rate", "sliding_rate", "gap", "gaps", "messages", "coverage", "start", "end"})
-"""Expectations of log times."""
-STAMP_KEYS = frozenset({"latency", "stamps"})
-HEADER_KEYS = STAMP_KEYS | {"frame_id", "sequence_numbers"}
-"""Expectations that need the header of messages."""
-ORDER_KEYS = frozenset({"out_of_order", "sequence_numbers"})
-"""Expectations of the order of messages in the files."""
-
-
-class FieldCheck(Struct, frozen=True):
-    """One expectation of an expression, and its accumulator."""
-
-    clause: Clause
-    expression: FieldExpression
-    accumulator: Accumulator
-
-
-@dataclass(slots=True)
-class RowMonitor:
-    """Observes the rows of one connection, or of one stored topic."""
-
-    clauses: Mapping[str, Clause]
-    checks: tuple[FieldCheck, ...]
-    latency: LatencyRange | None = None
-    steps: dict[str, Steps] = field(default_factory=dict[str, Steps])
-    """By `monotonic` and `unique`."""
-    frames: AllowedTexts | None = None
-    numbers: MissingNumbers | None = None
-    has_header: bool = True
-    """False if the rows have no header with a stamp and a frame."""
-
-    def __post_init__(self) -> None:
-        if "latency" in self.clauses:
-            expected = self.clauses["latency"].expected
-            self.latency = LatencyRange(expected.min, expected.max)
-        if "stamps" in self.clauses:
-            order = self.clauses["stamps"].expected.order
-            self.steps = {
-                name: Steps(name == "monotonic") for name in ((order,) if isinstance(order, str) else order)
-            }
-        if "frame_id" in self.clauses:
-            self.frames = AllowedTexts(self.clauses["frame_id"].expected.one_of)
-        if "sequence_numbers" in self.clauses:
-            self.numbers = MissingNumbers()
-
-    @property
-    def needs_messages(self) -> bool:
-        """Whether an expectation refers to fields of the message."""
-        return bool(HEADER_KEYS & self.clauses.keys()) or any(
-            not check.expression.is_ontology for check in self.checks
-        )
-
-    @property
-    def needs_ontology(self) -> bool:
-        """Whether an expectation refers to ontology columns, or to rejected messages."""
-        return "rejected" in self.clauses or any(check.expression.is_ontology for check in self.checks)
-
-    def add_messages(self, rows: Array, batch: Batch, envelope: Envelope) -> None:
-        """Add decoded messages in the ROS shape."""
-        if self.latency is not None or self.steps:
-            self._add_stamps(stamps_of(rows), batch)
-        if self.frames is not None and (frames := frames_of(rows)) is not None:
-            self.frames.add(batch, frames)
-        if self.numbers is not None and (numbers := header_numbers_of(rows)) is not None:
-            self.numbers.add(batch, numbers)
-        self.add_values(rows, batch, envelope)
-
-    def add_values(self, rows: Array, batch: Batch, envelope: Envelope) -> None:
-        """Add the values of messages in the ROS shape, without their headers."""
-        self._add_values(rows, batch, envelope, is_ontology=False)
-
-    def add_ontology(self, rows: Array, batch: Batch, envelope: Envelope) -> None:
-        """Add ontology rows."""
-        self._add_values(rows, batch, envelope, is_ontology=True)
-
-    def add_stored(self, rows: Array, batch: Batch, envelope: Envelope) -> None:
-        """Add rows of a stored topic, whose header is that of the ontology or of the ROS shape."""
-        if self.latency is not None or self.steps:
-            stored = ontology_stamps_of(rows)
-            self._add_stamps(stamps_of(rows) if stored is None else stored, batch)
-        if self.frames is not None and (frames := frames_of(rows)) is not None:
-            self.frames.add(batch, frames)
-        self._add_values(rows, batch, envelope, is_ontology=True)
-
-    def finish(self) -> None:
-        """Complete the accumulators after the last batch."""
-        for check in self.checks:
-            if isinstance(check.accumulator, Unchanged):
-                check.accumulator.finish()
-
-    def _add_stamps(self, stamps: NDArray[np.int64] | None, batch: Batch) -> None:
-        if stamps is None:
-            return
-        if self.latency is not None:
-            self.latency.add(batch, stamps)
-        for steps in self.steps.values():
-            steps.add(batch, stamps)
-
-    def _add_values(self, rows: Array, batch: Batch, envelope: Envelope, *, is_ontology: bool) -> None:
-        selected = [check for check in self.checks if check.expression.is_ontology is is_ontology]
-        if not selected or not len(rows):
-            return
-        evaluator = Evaluator(rows, envelope)
-        values: dict[str, Values] = {}
-        for check in selected:
-            text = check.expression.text
-            if text not in values:
-                values[text] = evaluator.values(check.expression)
-            check.accumulator.add(batch, values[text])
+if TYPE_CHECKING:
+    from mosaico_ingest.contracts.row_monitor import RowMonitor
 
 
 @dataclass(slots=True)
@@ -166,8 +27,10 @@ class TopicMonitor:
     name: str
     clauses: Mapping[str, Clause]
     times: TopicTimes
-    rows: dict[int, RowMonitor] = field(default_factory=dict[int, RowMonitor])
+    rows: dict[int, RowMonitor] = field(default_factory=dict)
     """By connection."""
+    has_rows: bool = False
+    """Whether an expectation refers to rows, not only to log times and the order in the files."""
     is_merged: bool = False
     """Whether the topic has several connections, whose log times are merged at the end."""
     read: int = 0
@@ -198,11 +61,10 @@ class TopicMonitor:
             rows.finish()
 
     def observer(
-        self, connection: int, msgtype: str, *, start_ns: int | None = None, end_ns: int | None = None
+        self, connection: int, *, start_ns: int | None = None, end_ns: int | None = None
     ) -> BlockObserver:
         """Return the observer of the message blocks of a connection, which ignores log times outside the range."""
-        rows = self.rows.get(connection)
-        return BlockObserver(self, connection, msgtype, rows, start_ns=start_ns, end_ns=end_ns)
+        return BlockObserver(self, connection, self.rows.get(connection), start_ns=start_ns, end_ns=end_ns)
 
 
 @dataclass(slots=True)
@@ -211,7 +73,6 @@ class BlockObserver:
 
     topic: TopicMonitor
     connection: int
-    msgtype: str
     rows: RowMonitor | None
     start_ns: int | None = None
     """Start of the observed log times; None for all of them."""
@@ -241,14 +102,14 @@ class BlockObserver:
         if self.rows is not None and self.rows.needs_ontology:
             self.rows.add_ontology(*self._observed(rows, index))
 
-    def _observed(self, rows: pa.StructArray, index: Int64s) -> tuple[pa.StructArray, Batch, Envelope]:
+    def _observed(self, rows: pa.StructArray, index: Int64s) -> tuple[pa.StructArray, Batch]:
         """Return the rows inside the range, with their log times and positions on the topic."""
         positions = index - self._skipped
         inside = (positions >= 0) & (positions < len(self._log_times))
         if not inside.all():
             rows, positions = rows.filter(pa.array(inside)), positions[inside]
         times = self._log_times[positions]
-        return rows, Batch(times, positions + self._first), Envelope(self.topic.name, self.msgtype, times)
+        return rows, Batch(times, positions + self._first)
 
 
 def topic_monitor(contract: Contract, name: str, references: Iterable[str] = ()) -> TopicMonitor | None:
@@ -275,7 +136,8 @@ def topic_monitor(contract: Contract, name: str, references: Iterable[str] = ())
             -np.inf if expected.min is None else expected.min * seconds - 1e-9,
             np.inf if expected.max is None else expected.max * seconds + 1e-9,
         )
-    return TopicMonitor(name, clauses, times)
+    has_rows = has_fields or bool(clauses.keys() & ROW_KEYS)
+    return TopicMonitor(name, clauses, times, has_rows=has_rows)
 
 
 def referenced_topics(contract: Contract) -> frozenset[str]:
@@ -285,57 +147,9 @@ def referenced_topics(contract: Contract) -> frozenset[str]:
     return frozenset(item.of for item in proximities if item is not None and item.of != RECORDING)
 
 
-def row_monitor(
-    contract: Contract, topic: str, message: Rows | None, ontology: Rows | None, *, stored: bool = False
-) -> tuple[RowMonitor | None, list[Finding]]:
-    """Return the monitor of the rows of a topic and the mistakes of its expressions.
-
-    The monitor is None if nothing about the rows is expected, or if an expression has a mistake.
-    """
-    clauses = contract.topic_clauses(topic)
-    checks: list[FieldCheck] = []
-    findings: list[Finding] = []
-    for text, expected, of_field in contract.field_clauses(topic):
-        path = of_field[0].path[:-1] if of_field else ()
-        locate = locator(contract.job.span(*path) if path else None, text)
-        expression, mistakes = bind_expression(text, message, ontology, locate)
-        if expression is not None:
-            mistakes = list(type_findings(expression, expected, locate))
-        if mistakes or expression is None:
-            findings += mistakes
-            continue
-        checks += [
-            FieldCheck(clause, expression, _ACCUMULATORS[clause.key](clause.expected)) for clause in of_field
-        ]
-    wanted = clauses.keys() & (HEADER_KEYS | {"rejected"})
-    if findings or not (checks or wanted):
-        return None, findings
-    shape = ontology if stored else message
-    names = () if shape is None else tuple(member.name for member in shape.struct)
-    return RowMonitor(clauses, tuple(checks), has_header="header" in names), []
-
-
 def file_order(contract: Contract, topics: Iterable[str], *, is_mcap: bool) -> FileOrder | None:
     """Return the observer of the order in the files, or None if no topic needs it."""
     wanted = {key for topic in topics for key in contract.topic_clauses(topic)} & ORDER_KEYS
     if "out_of_order" in wanted or (is_mcap and wanted):
         return FileOrder(has_numbers=is_mcap)
     return None
-
-
-_ACCUMULATORS: Mapping[str, Callable[[Any], Accumulator]] = {
-    "between": lambda expected: NumberLimits(*expected),
-    "min": lambda expected: NumberLimits(low=expected),
-    "max": lambda expected: NumberLimits(high=expected),
-    "finite": lambda _: FiniteNumbers(),
-    "nulls": Nulls,
-    "equals": lambda expected: AllowedValues((expected,)),
-    "one_of": lambda expected: AllowedValues(tuple(expected)),
-    "mean": lambda _: Moments(),
-    "std": lambda _: Moments(),
-    "change": lambda expected: Changes(
-        -np.inf if expected.min is None else expected.min, np.inf if expected.max is None else expected.max
-    ),
-    "unchanged": lambda expected: Unchanged(expected.max),
-}
-"""The constructors of accumulators of values, by key of the expectation."""

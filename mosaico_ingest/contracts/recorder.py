@@ -14,7 +14,6 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.rosbag.blocks import LATEST_NS, Connection, Encoding
 from mosaico_ingest.rosbag.recording import Recording
 
@@ -58,6 +57,8 @@ def read_events(recording: Recording) -> RecorderEvents:
     connections = {connection.id: connection for connection in event_connections(recording.connections)}
     if not connections:
         return RecorderEvents()
+    from mosaico_ingest.decode.decoder import decoder_for  # noqa: PLC0415 - few recordings have events
+
     decoders = {key: decoder_for(connection) for key, connection in connections.items()}
     events: list[tuple[int, str, str, bool]] = []
     for block in recording.message_blocks(tuple(connections)):

@@ -3,64 +3,28 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from mosaico_ingest.contracts.clauses import Clause, Contract, ReadTopic
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
-from mosaico_ingest.contracts.expressions import Rows
 from mosaico_ingest.contracts.monitor import (
     BlockObserver,
     TopicMonitor,
     file_order,
     referenced_topics,
-    row_monitor,
     topic_monitor,
 )
 from mosaico_ingest.contracts.recorder import read_events
-from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.values import OnFailure
-from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.blocks import ChunkChecksum, Connection
-from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.recording import Recording
 
 
-def check_expressions(
-    contract: Contract, connections: Sequence[Connection], topics: Iterable[ReadTopic]
-) -> None:
-    """Check the expressions of a contract against the message types of the topics that they apply to.
-
-    Raises:
-        ManifestError: An expression has a mistake; `findings` has all of them, with their locations.
-    """
-    findings = _expression_findings(contract, connections, topics)
-    if not findings:
-        return
-    first = findings[0]
-    more = f" (and {len(findings) - 1} more mistakes)" if len(findings) > 1 else ""
-    where = str(first.span or "expect")
-    raise ManifestError(f"{first.message}{more}", where=where, hint=first.help, findings=tuple(findings))
-
-
-def _expression_findings(
-    contract: Contract, connections: Sequence[Connection], topics: Iterable[ReadTopic]
-) -> list[Finding]:
-    by_id = {connection.id: connection for connection in connections}
-    findings: dict[Finding, None] = {}
-    for topic in topics:
-        for key in topic.connections:
-            _, mistakes = row_monitor(contract, topic.topic, *_rows(by_id[key], topic))
-            findings.update(dict.fromkeys(mistakes))
-    return list(findings)
-
-
 class RecordingMonitor:
-    """Observes the messages of a recording for a contract whose expressions fit its topics (`check_expressions`)."""
+    """Observes the messages of a recording for a contract whose expressions fit its topics (`row_monitor.check_expressions`)."""
 
     def __init__(
         self,
@@ -106,8 +70,7 @@ class RecordingMonitor:
         if monitor is None:
             return None
         start_ns, end_ns = self._range
-        msgtype = self._connections[connection].msgtype
-        return monitor.observer(connection, msgtype, start_ns=start_ns, end_ns=end_ns)
+        return monitor.observer(connection, start_ns=start_ns, end_ns=end_ns)
 
     @property
     def observed(self) -> Mapping[str, TopicMonitor]:
@@ -142,10 +105,13 @@ class RecordingMonitor:
         if monitor is None:
             return
         self._monitors[topic.topic] = monitor
-        for key in topic.connections:
-            rows, _ = row_monitor(self._contract, topic.topic, *_rows(self._connections[key], topic))
-            if rows is not None:
-                monitor.rows[key] = rows
+        if monitor.has_rows:
+            from mosaico_ingest.contracts.row_monitor import connection_monitor  # noqa: PLC0415 - log times need no Arrow functions
+
+            for key in topic.connections:
+                rows, _ = connection_monitor(self._contract, self._connections[key], topic)
+                if rows is not None:
+                    monitor.rows[key] = rows
         filled = [key for key in self._of_topic[topic.topic] if self._connections[key].count != 0]
         monitor.is_merged = len(filled) > 1
 
@@ -261,21 +227,6 @@ class RecordingMonitor:
             if item.connection == connection.id and item.file.endswith("metadata.yaml")
         )
         return None if connection.count is None else connection.count - absent
-
-
-def _rows(connection: Connection, topic: ReadTopic) -> tuple[Rows | None, Rows | None]:
-    message = None if connection.definition is None else message_rows(connection.definition)
-    return message, None if topic.ontology is None else ontology_rows(topic.ontology)
-
-
-def message_rows(definition: Definition) -> Rows:
-    """Return the rows of messages in the ROS shape."""
-    return Rows(ros_shape(definition), definition.types, definition.root, definition.root)
-
-
-def ontology_rows(ontology: OntologyType) -> Rows:
-    """Return the rows of an ontology type."""
-    return Rows(ontology.struct, {}, None, ontology.tag)
 
 
 def summary(result: ContractResult) -> dict[str, Any]:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from math import inf
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mosaico_ingest.contracts import texts
 from mosaico_ingest.contracts.clauses import Clause, occurrence
-from mosaico_ingest.contracts.monitor import FieldCheck, RowMonitor
 from mosaico_ingest.contracts.values import (
     AllowedValues,
     Changes,
@@ -24,6 +23,9 @@ from mosaico_ingest.contracts.values import (
 from mosaico_ingest.job.values import Limit
 from mosaico_ingest.report.contract import ExpectationResult, Occurrence
 from mosaico_ingest.report.units import count_text, counted
+
+if TYPE_CHECKING:
+    from mosaico_ingest.contracts.row_monitor import FieldCheck, RowMonitor
 
 
 def header_result(clause: Clause, monitors: Sequence[RowMonitor], msgtype: str) -> ExpectationResult:

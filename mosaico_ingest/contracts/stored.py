@@ -16,14 +16,9 @@ from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.adapters.mapping.expressions import FieldAccess, TypedExpression
 from mosaico_ingest.contracts.clauses import Clause, Contract
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate
-from mosaico_ingest.contracts.monitor import (
-    RowMonitor,
-    TopicMonitor,
-    referenced_topics,
-    row_monitor,
-    topic_monitor,
-)
-from mosaico_ingest.contracts.recording_monitor import message_rows, ontology_rows
+from mosaico_ingest.contracts.expressions import message_rows, ontology_rows
+from mosaico_ingest.contracts.monitor import TopicMonitor, referenced_topics, topic_monitor
+from mosaico_ingest.contracts.row_monitor import RowMonitor, row_monitor
 from mosaico_ingest.contracts.values import Batch
 from mosaico_ingest.destinations.store import Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError
@@ -78,7 +73,8 @@ def _observe(
 ) -> None:
     messages = _messages(topic, bridge)
     message = None if messages is None else message_rows(messages.definition)
-    rows, _ = row_monitor(contract, topic.name, message, ontology_rows(topic.ontology), stored=True)
+    ontology = ontology_rows(topic.ontology)
+    rows, _ = row_monitor(contract, topic.name, _msgtype(topic), message, ontology, stored=True)
     restores = (
         rows is not None
         and messages is not None
@@ -92,12 +88,11 @@ def _observe(
             continue
         struct = struct_of(batch.columns[1:], topic.ontology.struct, None, batch.num_rows)
         of_batch = Batch(times, np.arange(first, first + len(times), dtype=np.int64))
-        envelope = Envelope(topic.name, _msgtype(topic), times)
-        rows.add_stored(struct, of_batch, envelope)
+        rows.add_stored(struct, of_batch)
         if restores and messages is not None:
-            restored = messages.inverse.restore(struct, envelope)
+            restored = messages.inverse.restore(struct, Envelope(topic.name, _msgtype(topic), times))
             rows = _without_defaulted(rows, restored.defaulted)
-            rows.add_values(restored.rows, of_batch, envelope)
+            rows.add_values(restored.rows, of_batch)
     if rows is not None:
         monitor.rows[0] = rows
     monitor.finish()

@@ -1,4 +1,4 @@
-"""Streaming accumulators over the rows of one connection: header stamps, frames, and the values of expressions.
+"""Streaming accumulators over the rows of one connection: header stamps, and the values of expressions.
 
 Every accumulator counts the violations of one expectation and keeps the first and the worst of them. Batches arrive in
 log-time order, and the state that is carried across batches makes the result independent of their size.
@@ -13,12 +13,25 @@ import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.columns import Array, arrays, field_of, pc, pt, time_ns
-from mosaico_ingest.contracts.expressions import Values
 from mosaico_ingest.job.values import Limit
 
 Mask: TypeAlias = NDArray[np.bool_]
 Value: TypeAlias = "bool | int | float | str | None"
+
+
+class Values(Struct, frozen=True):
+    """The values of an expression over a batch of rows."""
+
+    data: NDArray[Any]
+    """The values, with zero or an empty text in place of null, shape (n,)."""
+    null: NDArray[np.bool_] | None
+    """Where the values are null; None if no value is null."""
+    rows: NDArray[np.int64] | None
+    """The row of each value; None for one value per row."""
+
+    def row(self, position: int) -> int:
+        """Return the row of a value."""
+        return position if self.rows is None else int(self.rows[position])
 
 
 class Violation(Struct, frozen=True):
@@ -81,45 +94,6 @@ def _violation(batch: Batch, values: Values, position: int) -> Violation:
 def plain_values(data: NDArray[Any]) -> Values:
     """Return values without nulls, one per row."""
     return Values(data, None, None)
-
-
-def stamps_of(rows: Array) -> NDArray[np.int64] | None:
-    """Return the header stamps of messages in nanoseconds, shape (n,), 0 for null; None without a header stamp."""
-    return _times(_member(rows, "header", "stamp"), ("sec", "nanosec"))
-
-
-def ontology_stamps_of(rows: Array) -> NDArray[np.int64] | None:
-    """Return the header stamps of stored rows in nanoseconds, shape (n,), 0 for null; None without a header."""
-    return _times(_member(rows, "header", "timestamp"), ("seconds", "nanoseconds"))
-
-
-def frames_of(rows: Array) -> Array | None:
-    """Return the frame ids as an Arrow array; None if the rows have no header with a frame."""
-    return _member(rows, "header", "frame_id")
-
-
-def header_numbers_of(rows: Array) -> NDArray[np.int64] | None:
-    """Return `header.seq` of ROS 1, shape (n,); None if the rows have none."""
-    numbers = _member(rows, "header", "seq")
-    return None if numbers is None else _numbers(numbers).astype(np.int64)
-
-
-def _member(rows: Array, *names: str) -> Array | None:
-    for name in names:
-        if not pt.is_struct(rows.type) or rows.type.get_field_index(name) < 0:
-            return None
-        rows = field_of(rows, name)
-    return rows
-
-
-def _times(times: Array | None, parts: tuple[str, str]) -> NDArray[np.int64] | None:
-    if times is None or any(_member(times, part) is None for part in parts):
-        return None
-    return _numbers(time_ns(times, parts))
-
-
-def _numbers(array: Array) -> NDArray[Any]:
-    return np.asarray(array.fill_null(0) if array.null_count else array)
 
 
 @dataclass(slots=True)
@@ -224,32 +198,6 @@ def missing_between(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     """Return how many sequence numbers each step skips; a step back is a restart, not a gap."""
     wrapped = np.where(steps < -(1 << 31), steps + (1 << 32), steps)
     return np.where(wrapped > 1, wrapped - 1, 0)
-
-
-@dataclass(slots=True)
-class AllowedTexts:
-    """Texts that must be in a set, such as frame ids."""
-
-    allowed: tuple[str, ...]
-    count: int = 0
-    seen: dict[str, None] = field(default_factory=dict[str, None])
-    """The first texts that are not allowed."""
-    violations: Violations = field(default_factory=Violations)
-
-    def add(self, batch: Batch, texts: Array) -> None:
-        """Add the texts of a batch; null counts as an empty text."""
-        if not len(texts):
-            return
-        self.count += len(texts)
-        if texts.null_count:
-            texts = texts.fill_null("")
-        allowed = pc.is_in(texts, value_set=arrays.array(self.allowed, texts.type))
-        if allowed.true_count == len(texts):
-            return
-        bad = ~np.asarray(allowed)
-        for text in pc.unique(texts.filter(arrays.array(bad))).slice(0, 5).to_pylist():
-            self.seen[text] = None
-        self.violations.add(batch, plain_values(texts.to_numpy(zero_copy_only=False)), bad)
 
 
 @dataclass(slots=True)

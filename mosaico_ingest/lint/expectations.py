@@ -10,10 +10,11 @@ from mosaico_ingest.contracts.expressions import (
     Rows,
     bind_expression,
     locator,
+    message_rows,
+    ontology_rows,
     syntax_findings,
     type_findings,
 )
-from mosaico_ingest.contracts.recording_monitor import message_rows, ontology_rows
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.expect import AllowedNames, Expectations, TopicExpectations

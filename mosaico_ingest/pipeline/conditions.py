@@ -19,11 +19,11 @@ from mosaico_ingest.contracts.expressions import (
     FieldExpression,
     Locate,
     Rows,
-    Values,
     bind_expression,
     locator,
+    message_rows,
 )
-from mosaico_ingest.contracts.recording_monitor import message_rows
+from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job

@@ -1,40 +1,22 @@
-"""Data contracts without a run: the check of a complete recording, and the check of its index."""
+"""The check of a recording against its data contract, without a run: by its index if log times decide the contract."""
 
 from __future__ import annotations
 
-import numpy as np
-import pyarrow as pa
+from collections.abc import Mapping
 
-from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.contracts.clauses import Contract, ReadTopic
-from mosaico_ingest.contracts.monitor import TIME_KEYS, BlockObserver
+from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract, ReadTopic
 from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
-from mosaico_ingest.decode.decoder import decoder_for
-from mosaico_ingest.errors import AdapterError, ManifestError
+from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled
-from mosaico_ingest.pipeline.conditions import bind_conditions
-from mosaico_ingest.pipeline.contract import monitor_of
-from mosaico_ingest.pipeline.plan import Plan, TopicPlan
-from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.run import open_job
-from mosaico_ingest.pipeline.selection import row_selector, row_times
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.remote import RemotePath
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
-from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
-from mosaico_ingest.rosbag.definitions.linking import ros_shape
+from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.rosbag.blocks import Int64s
 from mosaico_ingest.rosbag.recording import Recording
 
-_WHOLE_FILE_KEYS = frozenset({"unreadable", "chunk_crcs"})
+WHOLE_FILE_KEYS = frozenset({"unreadable", "chunk_crcs"})
 """Expectations of the recording that require reading every chunk."""
-_INDEX_KEYS = frozenset({"duration", "start", "end", "messages", "metadata_counts"})
-"""Expectations of the recording that the index decides."""
-_SAMPLE_KEYS = frozenset(
-    {"latency", "stamps", "frame_id", "between", "min", "max", "finite", "equals", "one_of"}
-)
-"""Expectations of rows that a few messages can violate."""
 
 
 def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> ContractResult:
@@ -47,25 +29,25 @@ def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> Contr
         ManifestError: The job has no contract, or an expression does not fit the messages of a topic.
         IngestError: The recording cannot be opened or planned.
     """
-    if job.expect is None:
+    contract = Contract.of(job, group)
+    if contract is None:
         raise ManifestError(
             "the manifest has no data contract", where=job.origin.file, hint="add the section expect"
         )
     with open_job(job) as (recording, resolver):
-        contract = Contract.of(job, group)
-        if contract is not None and _needs_times_only(job, contract, recording):
+        has_definitions = all(one.definition is not None for one in recording.connections)
+        if has_definitions and needs_times_only(job):
             return _check_times(contract, recording)
-        bridge = ROSBridge.for_job(job)
-        plan = plan_recording(Task(job, group=group), recording, bridge=bridge, resolver=resolver)
-        monitor = monitor_of(plan, recording)
-        if monitor is None or plan.contract is None:
-            raise AssertionError
-        _observe(plan, plan.contract, recording, monitor)
-        return monitor.finish()
+        from mosaico_ingest.pipeline.contract_messages import check_messages  # noqa: PLC0415 - log times need no decoder
+
+        return check_messages(Task(job, group=group), recording, resolver)
 
 
-def _needs_times_only(job: Job, contract: Contract, recording: Recording) -> bool:
-    """Return whether log times decide the contract, and every topic would be read completely."""
+def needs_times_only(job: Job) -> bool:
+    """Return whether log times decide the contract of a job, and every topic would be read completely."""
+    contract = Contract.of(job)
+    if contract is None:
+        return False
     keys = {
         name
         for entry in contract.expect.topics.values()
@@ -74,11 +56,10 @@ def _needs_times_only(job: Job, contract: Contract, recording: Recording) -> boo
     }
     return (
         keys <= TIME_KEYS | {"type"}
-        and not any(clause.key in _WHOLE_FILE_KEYS for clause in contract.recording_clauses())
+        and not any(clause.key in WHOLE_FILE_KEYS for clause in contract.recording_clauses())
         and not (job.topics or job.adapters.load or job.adapters.override)
         and job.adapters.unmodeled is Unmodeled.KEEP
         and (job.bag.time.start, job.bag.time.end) == (None, None)
-        and all(one.definition is not None for one in recording.connections)
     )
 
 
@@ -89,7 +70,7 @@ def _check_times(contract: Contract, recording: Recording) -> ContractResult:
     ids = [one.id for one in recording.connections if monitor.observer(one.id) is not None]
     times = recording.index_times(ids)
     if times is not None:
-        _add_times(monitor, times)
+        add_times(monitor, times)
     else:
         for block in recording.message_blocks(ids):
             observer = monitor.observer(block.connection)
@@ -98,159 +79,9 @@ def _check_times(contract: Contract, recording: Recording) -> ContractResult:
     return monitor.finish()
 
 
-def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
-    """Return the results that the index of the recording decides; no message is read."""
-    monitor = monitor_of(plan, recording)
-    if monitor is None:
-        return []
-    topics = tuple(key for topic in plan.read_topics for key in topic.connections)
-    observed = [key for key in topics if monitor.observer(key) is not None]
-    times = None
-    if not any(
-        isinstance(path, RemotePath) for path in recording.files
-    ):  # a request per chunk would take long
-        times = recording.index_times(observed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
-    if times is None:
-        monitor = monitor_of(plan.replace(topics=()), recording)
-    else:
-        _add_times(monitor, times)
-    results = () if monitor is None else monitor.finish().results
-    return [result for result in results if _is_known(result, has_times=times is not None)]
-
-
-def sample_results(monitor: RecordingMonitor) -> list[ExpectationResult]:
-    """Return the expectations that some of the messages that a monitor observed violate."""
-    return [
-        result
-        for result in monitor.finish().results
-        if result.outcome is Outcome.FAILED
-        and result.topic is not None
-        and result.key.rpartition(".")[2] in _SAMPLE_KEYS
-    ]
-
-
-def _is_known(result: ExpectationResult, *, has_times: bool) -> bool:
-    if result.outcome is Outcome.SKIPPED:
-        return False
-    if result.topic is None:
-        return result.key in _INDEX_KEYS or not result.expectation.startswith("expect.recording.")
-    return result.key == "type" or (result.key in TIME_KEYS and (has_times or result.key == "messages"))
-
-
-def _observe(plan: Plan, contract: Contract, recording: Recording, monitor: RecordingMonitor) -> None:
-    """Observe every message for which something is expected, through the index where that is enough."""
-    topics = {key: topic for topic in plan.read_topics for key in topic.connections}
-    observers = {key: monitor.observer(key) for key in topics}
-    reads_all = any(clause.key in _WHOLE_FILE_KEYS for clause in contract.recording_clauses())
-    if not reads_all:
-        observers = {key: observer for key, observer in observers.items() if observer is not None}
-    timed = [key for key, observer in observers.items() if observer is None or observer.rows is None]
-    if reads_all or monitor.order is not None:
-        timed = []
-    times = (
-        recording.index_times(timed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns) if timed else {}
-    )
-    if times is not None:
-        _add_times(monitor, times)
-    read = [key for key in observers if times is None or key not in times]
-    if not read:
-        return
-    connections = {connection.id: connection for connection in recording.connections}
-    rows = {
-        key: _Rows(plan, topics[key], connections[key], observer, monitor)
-        for key in read
-        if (observer := observers[key]) is not None
-    }
-    order = monitor.order
-    blocks = recording.message_blocks(
-        tuple(read),
-        start_ns=plan.read_from_ns,
-        end_ns=plan.read_until_ns,
-        observe=None if order is None else order.add,
-    )
-    for block in blocks:
-        if block.connection in rows:
-            rows[block.connection].add(block)
-
-
-def _add_times(
-    monitor: RecordingMonitor, times: dict[int, np.ndarray[tuple[int], np.dtype[np.int64]]]
-) -> None:
+def add_times(monitor: RecordingMonitor, times: Mapping[int, Int64s]) -> None:
+    """Add all log times of some connections."""
     for key, of_connection in times.items():
         observer = monitor.observer(key)
         if observer is not None:
             observer.block(of_connection)
-
-
-class _Rows:
-    """Decodes and adapts the blocks of one connection, as far as an expectation needs it."""
-
-    def __init__(
-        self,
-        plan: Plan,
-        topic: TopicPlan,
-        connection: Connection,
-        observer: BlockObserver,
-        monitor: RecordingMonitor,
-    ) -> None:
-        self._topic = topic
-        self._connection = connection
-        self._observer = observer
-        self._monitor = monitor
-        self._read = 0
-        rows = observer.rows
-        self._decodes = rows is not None
-        self._adapts = rows is not None and rows.needs_ontology
-        self._decoder = decoder_for(connection) if self._decodes else None
-        definition = connection.definition
-        self._adapter = (
-            topic.adapter.bind(definition, ros_shape(definition))
-            if self._adapts and definition is not None
-            else None
-        )
-        self._selector = row_selector(plan, topic)
-        self._conditions = (
-            bind_conditions(topic, definition) if topic.has_conditions and definition is not None else None
-        )
-        if self._adapts:
-            monitor.reject(topic.topic, 0)
-
-    def add(self, block: MessageBlock) -> None:
-        """Add a block."""
-        self._observer.block(block.log_times)
-        positions = np.arange(len(block), dtype=np.int64)
-        sample = positions[(positions + self._read) % self._topic.every == 0]
-        self._read += len(block)
-        if self._decoder is None:
-            return
-        decoded = self._decoder.decode(block if len(sample) == len(block) else block.rows(sample))
-        rows, index = self._selected(block, decoded.rows, sample[decoded.index])
-        self._observer.messages(rows, index)
-        rejected = len(decoded.failures)
-        if self._adapter is not None:
-            topic = self._topic
-            envelope = Envelope(
-                topic.topic, topic.msgtype, block.log_times, block.publish_times, block.sequences
-            ).take(index)
-            try:
-                adapted = self._adapter.adapt(rows, envelope)
-            except AdapterError:
-                rejected += len(index)
-            else:
-                self._observer.ontology(adapted.rows, index[adapted.index])
-                rejected += len(adapted.failures)
-            self._monitor.reject(self._topic.topic, rejected)
-
-    def _selected(
-        self, block: MessageBlock, rows: pa.StructArray, index: Int64s
-    ) -> tuple[pa.StructArray, Int64s]:
-        """Return the rows that the settings of the topic keep, and their positions in the block."""
-        if self._selector is None:
-            return rows, index
-        log_times = block.log_times[index]
-        publish_times = None if block.publish_times is None else block.publish_times[index]
-        topic = self._topic
-        times = row_times(topic.stamp, topic.time_offset_ns, rows, log_times, publish_times)
-        envelope = Envelope(self._topic.topic, self._topic.msgtype, log_times)
-        keep, _ = self._selector.select(times.values, rows, envelope, self._conditions)
-        return (rows, index) if keep is None else (rows.filter(pa.array(keep)), index[keep])

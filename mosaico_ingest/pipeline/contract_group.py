@@ -11,7 +11,7 @@ from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.contracts.group import Member, group_results
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.pipeline.run import open_job
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.contract import ExpectationResult
 from mosaico_ingest.rosbag.recording import time_bounds

@@ -174,7 +174,7 @@ def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Reco
     """Return the data contract; raise ManifestError if an expression does not fit its topic."""
     contract = Contract.of(job, task.group)
     if contract is not None:
-        from mosaico_ingest.contracts.recording_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
+        from mosaico_ingest.contracts.row_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
 
         read = [topic.as_read for topic in topics if not topic.shares_messages]
         check_expressions(contract, recording.connections, read)

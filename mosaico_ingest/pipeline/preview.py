@@ -23,8 +23,9 @@ from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.pipeline.contract import monitor_of
-from mosaico_ingest.pipeline.contract_check import index_results, sample_results
 from mosaico_ingest.pipeline.contract_group import results_by_job
+from mosaico_ingest.pipeline.contract_messages import index_results, sample_results
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.plan_document import (
     DestinationState,
@@ -36,7 +37,7 @@ from mosaico_ingest.pipeline.plan_document import (
 )
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import StoredProvenance, is_repeatable, read_provenance
-from mosaico_ingest.pipeline.run import open_job, preflight
+from mosaico_ingest.pipeline.run import preflight
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Generator, Iterator
-from contextlib import contextmanager
-from pathlib import Path
+from collections.abc import Iterator
 
 from msgspec import Struct
 
@@ -17,13 +15,13 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.fingerprint import fingerprint, is_fingerprinted
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
 from mosaico_ingest.pipeline.pump import verify, write_sequence
 from mosaico_ingest.pipeline.rejection_log import RejectionLog
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.remote import with_network
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
@@ -41,9 +39,8 @@ from mosaico_ingest.report.events import (
 )
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.timing import Step, Stopwatch
-from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES
-from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
-from mosaico_ingest.rosbag.recording import Recording, open_recording
+from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.recording import Recording
 
 _log = logging.getLogger(__name__)
 
@@ -111,21 +108,6 @@ def _check_group(plan: Plan) -> None:
         from mosaico_ingest.pipeline.contract import check_group  # noqa: PLC0415 - only contracts need it
 
         check_group(plan)
-
-
-@contextmanager
-def open_job(job: Job) -> Generator[tuple[Recording, TypeResolver]]:
-    """Open the recording of a job with the resolver for its message definitions.
-
-    Raises:
-        BagError: The recording cannot be opened.
-    """
-    custom = [(messages.package, Path(messages.path), messages.store) for messages in job.bag.custom_msgs]
-    resolver = TypeResolver(job.bag.ros_distro, custom, registry=job.registry or ROSTypeRegistry)
-    max_chunk_bytes = job.bag.max_chunk_size or MAX_CHUNK_BYTES
-    paths = [with_network(path, job.network.limits) for path in job.paths]
-    with open_recording(paths, resolve=resolver, max_chunk_bytes=max_chunk_bytes) as recording:
-        yield recording, resolver
 
 
 def make_plan(task: Task) -> Plan:

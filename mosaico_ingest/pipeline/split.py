@@ -23,8 +23,8 @@ from mosaico_ingest.job.model import Job, TopicSettings
 from mosaico_ingest.job.patterns import select
 from mosaico_ingest.job.split import SequencePart, clean_name
 from mosaico_ingest.job.values import StampSource
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import time_range
-from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.pipeline.selection import Int64s, Mask, block_times
 from mosaico_ingest.rosbag.recording import Recording
 

@@ -304,7 +304,8 @@ class Recording:
     ) -> dict[int, Int64s] | None:
         """Return the log times of some connections with start_ns <= log time < end_ns, sorted, without their messages.
 
-        The times are those of the index, so messages that cannot be read count, too. None if a file has no index.
+        The times are those of the index, so messages that cannot be read count, too. None if a file has no index, or if
+        its index contradicts itself: the number of times differs from the number of messages of the connection.
         """
         parts: dict[int, list[Int64s]] = {key: [] for key in connection_ids}
         for number, split in enumerate(self._splits):
@@ -315,6 +316,9 @@ class Recording:
                 return None
             for key, arrays in times.items():
                 parts[self._table.connection_id(number, key)] += arrays
+        counts = {one.id: one.count for one in self._table.connections}
+        if any(counts[key] not in {None, sum(map(len, arrays))} for key, arrays in parts.items()):
+            return None
         first = 0 if start_ns is None else max(start_ns, 0)
         end = LATEST_NS if end_ns is None else end_ns - 1
         return {key: _sorted_times(arrays, first, end) for key, arrays in parts.items()}

@@ -16,8 +16,8 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.expand import plain
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.contract import monitor_of
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.contract import ContractResult, Outcome

@@ -21,8 +21,8 @@ from mosaico_ingest.pipeline.definition_lock import (
     merge_locks,
     read_lock,
 )
+from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.run import open_job
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.textfile import write_atomically
 

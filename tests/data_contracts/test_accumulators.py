@@ -12,11 +12,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.contracts.expressions import Values
+from mosaico_ingest.contracts.headers import AllowedTexts
 from mosaico_ingest.contracts.order import FileOrder
 from mosaico_ingest.contracts.times import PERIOD_SAMPLE, Gaps, SlidingWindow, TopicTimes
 from mosaico_ingest.contracts.values import (
-    AllowedTexts,
     AllowedValues,
     Batch,
     Changes,
@@ -28,6 +27,7 @@ from mosaico_ingest.contracts.values import (
     NumberLimits,
     Steps,
     Unchanged,
+    Values,
 )
 from mosaico_ingest.job.values import Interval, Limit
 from mosaico_ingest.rosbag.blocks import MessageBlock

@@ -157,7 +157,10 @@ class McapReader:
         return attachment_chunks(self._source, attachment)
 
     def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
-        """Return the log times of some connections according to the message indexes; None if a chunk has none."""
+        """Return the log times of some connections according to the message indexes.
+
+        None if a chunk has no index, or if its index has times outside the time range of the chunk.
+        """
         extents, unreadable = self._all_extents()
         requested = [extent for extent in extents if extent.has_any(connections)]
         if unreadable or any(not extent.indexes for extent in requested):
@@ -169,12 +172,18 @@ class McapReader:
             try:
                 raw = memoryview(self._source.read(start, extent.stop - start))
                 indexes = replace(extent, offset=start)
-                for key, offset in offsets:
-                    if key in times:
-                        entries = np.frombuffer(_index_entries(raw, indexes, key, offset), _INDEX_ENTRY)
-                        times[key].append(entries["time"])
+                of_chunk = {
+                    key: np.frombuffer(_index_entries(raw, indexes, key, offset), _INDEX_ENTRY)["time"]
+                    for key, offset in offsets
+                    if key in times
+                }
             except BagError:
                 return None
+            all_times = np.concatenate(list(of_chunk.values()))
+            if len(all_times) and (all_times.min() < extent.start_ns or all_times.max() > extent.end_ns):
+                return None
+            for key, of_connection in of_chunk.items():
+                times[key].append(of_connection)
         return times
 
     def check_unchanged(self) -> None:
