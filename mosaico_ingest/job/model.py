@@ -6,6 +6,7 @@ import re
 from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from math import prod
+from os.path import abspath
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
 
@@ -26,6 +27,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 from typing_extensions import Self
 
+from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
 from mosaico_ingest.job.adapter_reference import AdapterReference, LoadedAdapter
@@ -59,7 +61,7 @@ from mosaico_ingest.job.values import (
     Unmodeled,
 )
 from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
-from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
+from mosaico_ingest.remote import AnyPath, Network, RemotePath, as_path, with_network
 
 VERSION = 1
 """The newest manifest version that this tool reads."""
@@ -556,6 +558,23 @@ class Job(JobSettings):
     def family(self) -> str:
         """The name that sequences with the same message definitions share."""
         return self.sequence.family or self.sequence.name
+
+    @property
+    def main_path(self) -> AnyPath:
+        """The path that names the recording: a directory for its `metadata.yaml`."""
+        first = self.paths[0]
+        main = first.parent if first.name == "metadata.yaml" else first
+        return Path(abspath(main)) if isinstance(main, Path) else main  # noqa: PTH100 - keep the names of links
+
+    @property
+    def sidecar(self) -> AnyPath | None:
+        """The path of the recording's side-car file, which need not exist; None if the job has no such source."""
+        sources = self.sequence.metadata_from
+        if sources is None or sources.sidecar is None:
+            return None
+        path = self.main_path
+        texts = {"stem": RECORDING_NAME.sub("", path.name), "name": path.name, "parent": path.parent.name}
+        return path.parent / re.sub(r"\{(\w+)\}", lambda match: texts[match[1]], sources.sidecar)
 
     @property
     def destination(self) -> Target:

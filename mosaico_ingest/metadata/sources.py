@@ -5,14 +5,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
-from os.path import abspath
-from pathlib import Path
 from typing import Any
 
 from msgspec import Struct, field
 from msgspec.structs import replace
 
-from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, join_names, nearest
 from mosaico_ingest.job.file_names import FileNamePattern
@@ -120,27 +117,20 @@ def _additions(job: Job, recording: Recording) -> Iterator[_Addition]:
     sources = job.sequence.metadata_from
     if sources is None:
         return
-    path = _main_path(job)
+    path = job.main_path
     if sources.records:
         yield from _record_additions(job, sources.records, recording)
     if sources.custom_data:
         yield _custom_data(job, recording)
     if sources.file_name is not None:
         yield _file_name(job, sources.file_name, path)
-    sidecar = sidecar_path(job)
+    sidecar = job.sidecar
     if sidecar is not None:
         yield _sidecar(job, sidecar)
 
 
 def _span(job: Job, *path: str | int) -> Span | None:
     return job.value_span("sequence", "metadata_from", *path) or job.span("sequence", "metadata_from", *path)
-
-
-def _main_path(job: Job) -> AnyPath:
-    """Return the path that names the recording: a directory for its `metadata.yaml`."""
-    first = job.paths[0]
-    main = first.parent if first.name == "metadata.yaml" else first
-    return Path(abspath(main)) if isinstance(main, Path) else main  # noqa: PTH100 - keep the names of links
 
 
 def _record_additions(job: Job, patterns: Sequence[str], recording: Recording) -> Iterator[_Addition]:
@@ -194,16 +184,6 @@ def _file_name(job: Job, pattern: FileNamePattern, path: AnyPath) -> _Addition:
         problem=f"the file name {name!r} does not match {pattern.text!r}",
         hint="rename the recording, or correct the pattern",
     )
-
-
-def sidecar_path(job: Job) -> AnyPath | None:
-    """Return the path of the recording's side-car file, which need not exist; None if the job has no such source."""
-    sources = job.sequence.metadata_from
-    if sources is None or sources.sidecar is None:
-        return None
-    path = _main_path(job)
-    texts = {"stem": RECORDING_NAME.sub("", path.name), "name": path.name, "parent": path.parent.name}
-    return path.parent / re.sub(r"\{(\w+)\}", lambda match: texts[match[1]], sources.sidecar)
 
 
 def _sidecar(job: Job, file: AnyPath) -> _Addition:

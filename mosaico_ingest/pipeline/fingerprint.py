@@ -23,7 +23,6 @@ from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.model import Job, JobSettings
-from mosaico_ingest.metadata.sources import sidecar_path
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, definition_files
 from mosaico_ingest.rosbag.discovery import FILE_NAME
@@ -99,7 +98,7 @@ def _recording_states(job: Job) -> Iterator[State]:
         else:
             yield _state(path, properties)
             yield _state_or_absence(path.with_name(FILE_NAME))
-    sidecar = sidecar_path(job)
+    sidecar = job.sidecar
     if isinstance(sidecar, RemotePath):
         yield (str(sidecar), sidecar.now().version() if sidecar.now().exists() else "")
     elif sidecar is not None:

@@ -58,7 +58,14 @@ from mosaico_ingest.rosbag.definitions.model import (
     Source,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.discovery import Metadata, MetadataTopic, RecordingFiles, discover, parse_metadata
+from mosaico_ingest.rosbag.discovery import (
+    Metadata,
+    MetadataTopic,
+    RecordingFiles,
+    discover,
+    may_have_custom_data,
+    parse_metadata,
+)
 from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, MessageEncoding, refusal
 from mosaico_ingest.rosbag.listed_counts import add_missing_messages, listed_counts, missing_after_reading
 from mosaico_ingest.rosbag.opening import open_split
@@ -262,7 +269,7 @@ class Recording:
         if self.metadata is not None:
             return dict(self.metadata.custom_data)
         text = self.metadata_records().get(ROSBAG2_RECORD, {}).get(ROSBAG2_ENTRY)
-        if text is None:
+        if text is None or not may_have_custom_data(text):
             return {}
         with suppress(BagError):
             return dict(parse_metadata(text, self.files[0], is_embedded=True).custom_data)
