@@ -203,7 +203,7 @@ _TABLE = (
     Rule("ING641", "too-many-parts", _ERROR, "a `split` that makes too many sequences"),
     Rule("ING642", "empty-part", _INFO, "a part of a recording without rows"),
     Rule("ING643", "attachments-not-stored", _WARNING, "attachments that the destination cannot store"),
-    Rule("ING644", "damaged-attachment", _WARNING, "an attachment that differs from its checksum"),
+    Rule("ING644", "damaged-record", _WARNING, "a damaged attachment or metadata record of a recording"),
     Rule("ING645", "replaced-by-deletion", _INFO, "a replacement on a server, which cannot swap sequences"),
     Rule(
         "ING650", "no-inverse", _WARNING, "a topic that an export excludes because its adapter has no inverse"

@@ -7,7 +7,7 @@ merges the tasks of all splits by time, and yields `MessageBlock`s whose connect
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 from typing import Any, Protocol, TypeVar, runtime_checkable
@@ -245,8 +245,12 @@ class HasMetadataRecords(Protocol):
 class HasAttachments(Protocol):
     """A reader of a container that can contain attachments."""
 
-    def attachments(self) -> list[Attachment]:
+    def attachments(self) -> Sequence[Attachment]:
         """Return the attachments without their content."""
+        ...
+
+    def damaged_records(self) -> Sequence[str]:
+        """Return one line for each attachment and metadata record that cannot be read."""
         ...
 
     def attachment_chunks(self, attachment: Attachment) -> Iterator[bytes]:

@@ -72,6 +72,7 @@ from mosaico_ingest.rosbag.opening import open_split
 
 BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
 """Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
+DAMAGED_RECORD_HELP = "copy the file again, or restore it from a backup"
 _SMALL_RECORDING_BYTES = 1 << 20
 """Up to this size, reading the recording takes less time than starting a prefetch thread."""
 _MAX_READERS = 3
@@ -567,7 +568,11 @@ def recording_findings(
     unreadable: Sequence[UnreadableRange],
     metadata: Metadata | None,
 ) -> tuple[Finding, ...]:
-    """Return the findings of an opened recording: notes, damage, connections, differences from its metadata."""
+    """Return the findings of an opened recording: notes, damage, connections, differences from its metadata.
+
+    Raises:
+        BagError: The file cannot be read.
+    """
     findings = [
         Finding("container-note", Severity.INFO, f"{split.path}: {note}")
         for split in splits
@@ -576,6 +581,12 @@ def recording_findings(
     findings += (
         Finding("unreadable-range", Severity.WARNING, f"{gap.file}: at {gap.offset}: {gap.reason}")
         for gap in unreadable
+    )
+    findings += (
+        Finding("damaged-record", Severity.WARNING, f"{split.path}: {problem}", help=DAMAGED_RECORD_HELP)
+        for split in splits
+        if isinstance(split, HasAttachments)
+        for problem in split.damaged_records()
     )
     findings += _connection_findings(connections)
     if metadata:

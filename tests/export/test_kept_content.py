@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2
 from rosbags.typesys import Stores, get_typestore
 
-from mosaico_ingest import api
+from mosaico_ingest import api, inspect
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.store import verify_attachments
@@ -99,10 +99,35 @@ def test_damaged_attachment_is_reported_and_not_stored(tmp_path: Path) -> None:
     original = write_mcap(tmp_path / "drive.mcap", plain=b"hello attachment")
     original.write_bytes(original.read_bytes().replace(b"hello attachment", b"jello attachment"))
     report, store = ingest(original)
-    assert ["[damaged-attachment]" in finding for finding in report.findings] == [True]
+    assert ["[damaged-record]" in finding for finding in report.findings] == [True]
     assert [each.name for each in store.sequence("drive").attachments] == ["calib/cam 0.yaml"]
     files = [path for path in (tmp_path / "store" / "attachments").rglob("*") if path.is_file()]
     assert len(files) == 1
+
+
+@pytest.mark.parametrize("indexed", [True, False])
+def test_damaged_records_are_reported_by_inspect_plan_and_run(tmp_path: Path, *, indexed: bool) -> None:
+    """The sizes of a text in a metadata record and in an attachment exceed their records."""
+    original = write_mcap(tmp_path / "drive.mcap", indexed=indexed)
+    content = original.read_bytes()
+    name = len(b"vehicle.info").to_bytes(4, "little") + b"vehicle.info"
+    media_type = len(b"text/yaml").to_bytes(4, "little") + b"text/yaml"
+    for field in (name, media_type):
+        content = content.replace(field, b"\xff\xff\xff\x7f" + field[4:], 1)
+    original.write_bytes(content)
+    expected = [
+        f"the metadata record at {content.index(b'vehicle.info') - 13} cannot be read",
+        f"the attachment at {content.index(b'calib/cam 0.yaml') - 29} cannot be read",
+    ]
+    report, store = ingest(original)
+    (plan,) = api.plan_job(tmp_path / "job.yaml").recordings
+    notes = [f"{note.severity.value}[{note.rule}] {note.message}" for note in plan.notes]
+    for findings in (report.findings, inspect(original).findings, notes):
+        damaged = [finding for finding in findings if finding.startswith("warning[damaged-record]")]
+        assert [text in finding for text, finding in zip(expected, damaged, strict=True)] == [True, True]
+    info = store.sequence("drive")
+    assert [each.name for each in info.attachments] == ["empty.bin"]
+    assert [record["name"] for record in info.metadata[RECORDS_KEY]] == ["empty"]
 
 
 def test_keep_settings_select_records_and_attachments(tmp_path: Path) -> None:

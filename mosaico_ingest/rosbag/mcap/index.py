@@ -5,7 +5,6 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
@@ -88,12 +87,10 @@ class McapIndex:
     unreadable: list[UnreadableRange] = field(default_factory=list[UnreadableRange])
     metadata: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
     """Start and end of the content of each metadata record."""
-    lists_metadata: bool = True
-    """Whether `metadata` is complete; the summary may omit the index of metadata records."""
     attachments: list[tuple[int, int]] = field(default_factory=list[tuple[int, int]])
     """Start and end of the content of each attachment record."""
-    lists_attachments: bool = True
-    """Whether `attachments` is complete; the summary may omit the index of attachments."""
+    lists_kept_records: bool = True
+    """Whether `metadata` and `attachments` are complete; the summary may omit the indexes of these records."""
     is_walked: bool = False
     """Whether the index comes from a walk over all records rather than from the summary."""
 
@@ -135,30 +132,41 @@ def read_extents(
     return sorted(listed + unlisted.extents, key=lambda extent: extent.start_ns), unlisted.unreadable
 
 
-def read_metadata(
+class KeptRecords(Struct, frozen=True):
+    """The records of a file that a sequence keeps besides messages."""
+
+    metadata: tuple[MetadataRecord, ...]
+    attachments: tuple[Attachment, ...]
+    damaged: tuple[str, ...]
+    """One line for each record that cannot be read."""
+
+
+def read_kept_records(
     source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
-) -> list[MetadataRecord]:
-    """Return the metadata records; damaged ones are skipped. Walks over the records if the summary does not list them."""
-    ranges = index.metadata
-    if not index.lists_metadata:
-        ranges = _walked(source, index, max_chunk_bytes).metadata
-    return list(_undamaged(ranges, lambda start, end: metadata_of(Fields(source.read(start, end - start)))))
+) -> KeptRecords:
+    """Return the metadata records and attachments; walks over all records if the summary does not list them."""
+    if not index.lists_kept_records:
+        walked = McapIndex()
+        _Walk(source, walked, max_chunk_bytes).over(len(MCAP), index.data_end)
+        index = walked
+    damaged: list[str] = []
 
+    def undamaged(kind: str, ranges: Iterable[tuple[int, int]], read: Callable[[int, int], T]) -> Iterator[T]:
+        for start, end in ranges:
+            try:
+                yield read(start, end)
+            except BagError as err:  # noqa: PERF203 - each record may be damaged
+                damaged.append(f"the {kind} at {start - RECORD.size} cannot be read: {err.what}")
 
-def read_attachments(
-    source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
-) -> list[Attachment]:
-    """Return the attachments; damaged ones are skipped. Walks over the records if the summary does not list them."""
-    ranges = index.attachments
-    if not index.lists_attachments:
-        ranges = _walked(source, index, max_chunk_bytes).attachments
-    return list(_undamaged(ranges, partial(_attachment, source)))
-
-
-def _undamaged(ranges: Iterable[tuple[int, int]], read: Callable[[int, int], T]) -> Iterator[T]:
-    for start, end in ranges:
-        with suppress(BagError):
-            yield read(start, end)
+    metadata = tuple(
+        undamaged(
+            "metadata record",
+            index.metadata,
+            lambda start, end: metadata_of(Fields(source.read(start, end - start))),
+        )
+    )
+    attachments = tuple(undamaged("attachment", index.attachments, partial(_attachment, source)))
+    return KeptRecords(metadata, attachments, tuple(damaged))
 
 
 def attachment_chunks(source: Source, attachment: Attachment) -> Iterator[bytes]:
@@ -188,12 +196,6 @@ def _attachment(source: Source, start: int, end: int) -> Attachment:
         raise BagError(f"the attachment {name!r} has {size} bytes, which do not fit its record")
     has_crc = source.read(end - 4, 4) != bytes(4)
     return Attachment(name, media_type, log_ns, create_ns, size, has_crc, offset=start, data_offset=data)
-
-
-def _walked(source: Source, index: McapIndex, max_chunk_bytes: int) -> McapIndex:
-    walked = McapIndex()
-    _Walk(source, walked, max_chunk_bytes).over(len(MCAP), index.data_end)
-    return walked
 
 
 def _read_summary(source: Source) -> McapIndex | None:
@@ -236,8 +238,10 @@ def _parse_summary(data: bytes, data_end: int) -> McapIndex | None:
     counts = index.counts
     if counts is None or chunk_count != len(index.extents) or not index.channels.keys() >= counts.keys():
         return None
-    index.lists_metadata = metadata_count == len(index.metadata)
-    index.lists_attachments = attachment_count == len(index.attachments)
+    index.lists_kept_records = (metadata_count, attachment_count) == (
+        len(index.metadata),
+        len(index.attachments),
+    )
     return index
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Collection, Iterator, Sequence
-from functools import partial
+from functools import cached_property, partial
 from itertools import pairwise
 from operator import itemgetter
 
@@ -49,12 +49,12 @@ from mosaico_ingest.rosbag.compression import (
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.mcap.index import (
     Extent,
+    KeptRecords,
     McapIndex,
     attachment_chunks,
-    read_attachments,
     read_extents,
     read_index,
-    read_metadata,
+    read_kept_records,
 )
 from mosaico_ingest.rosbag.mcap.records import RECORD, ChannelRecord, ChunkHead, Op, SchemaRecord, chunk_head
 from mosaico_ingest.rosbag.source import ReadBuffer, Source
@@ -144,13 +144,21 @@ class McapReader:
     def metadata_records(self) -> dict[str, dict[str, str]]:
         """Return the entries of the metadata records by name; of two entries with one key, the later one."""
         records: dict[str, dict[str, str]] = {}
-        for record in read_metadata(self._source, self._index, self._max_chunk_bytes):
+        for record in self._kept.metadata:
             records.setdefault(record.name, {}).update(record.entries)
         return records
 
-    def attachments(self) -> list[Attachment]:
+    def attachments(self) -> tuple[Attachment, ...]:
         """Return the attachments without their content."""
-        return read_attachments(self._source, self._index, self._max_chunk_bytes)
+        return self._kept.attachments
+
+    def damaged_records(self) -> tuple[str, ...]:
+        """Return one line for each metadata record and attachment that cannot be read."""
+        return self._kept.damaged
+
+    @cached_property
+    def _kept(self) -> KeptRecords:
+        return read_kept_records(self._source, self._index, self._max_chunk_bytes)
 
     def attachment_chunks(self, attachment: Attachment) -> Iterator[bytes]:
         """Yield the content of an attachment; see `index.attachment_chunks`."""
