@@ -132,7 +132,8 @@ def _contact_sheet(topic: TopicInfo, count: int, size: int) -> tuple[Pixels, str
     from mosaico_ingest.view.images import contact_sheet
     from mosaico_ingest.view.pictures import thumbnails
 
-    pictures = thumbnails(topic, count, size=min(size, 400))
+    side = min(size, 400)
+    pictures = thumbnails(topic, count, width=side, height=side)
     labeled = [
         (f"+{seconds_text(each.offset_s)}", each.pixels) for each in pictures if each.pixels is not None
     ]

@@ -9,13 +9,11 @@ import numpy as np
 from msgspec import Struct
 
 from mosaico_ingest.destinations.store.model import TopicInfo
-from mosaico_ingest.errors import IngestError
 from mosaico_ingest.images.files import jpeg_file
 from mosaico_ingest.report.units import time_text
 from mosaico_ingest.view.clouds import grid_step
-from mosaico_ingest.view.images import Pixels, fit_pixels, has_images, png_bytes
-from mosaico_ingest.view.pictures import row_picture
-from mosaico_ingest.view.rows import sampled_rows
+from mosaico_ingest.view.images import Pixels, has_images, png_bytes
+from mosaico_ingest.view.pictures import thumbnails
 from mosaico_ingest.view.tracks import Track, local_metres
 
 IMAGES = 12
@@ -70,19 +68,19 @@ class Map(Struct, frozen=True):
 
 
 def picture_strip(topic: TopicInfo) -> Strip:
-    """Return the pictures of rows at equal distances, with the reason for each picture that cannot be shown."""
+    """Return the pictures of rows at equal distances in time, with the reason for each picture that cannot be shown."""
     is_image = has_images(topic.schema)
+    if is_image:
+        shown = thumbnails(topic, IMAGES, width=WIDTH, height=HEIGHT)
+    else:
+        shown = thumbnails(topic, CLOUDS, width=CLOUD_SIZE, height=CLOUD_SIZE)
     pictures: list[Picture] = []
-    problems: dict[str, None] = {}
-    for row in sampled_rows(topic, IMAGES if is_image else CLOUDS).to_pylist():
-        try:
-            pixels = row_picture(topic, row, size=CLOUD_SIZE)
-            source = _jpeg_url(pixels) if is_image else _png_url(pixels)
-        except IngestError as error:
-            problems[str(error)] = None
-            continue
-        time = time_text(row["timestamp_ns"])
-        pictures.append(Picture(source, time.partition(" ")[2], f"{topic.name} at {time} UTC"))
+    for each in shown:
+        if each.pixels is not None:
+            source = _jpeg_url(each.pixels) if is_image else _png_url(each.pixels)
+            time = time_text(each.time_ns)
+            pictures.append(Picture(source, time.partition(" ")[2], f"{topic.name} at {time} UTC"))
+    problems = dict.fromkeys(each.problem for each in shown if each.problem is not None)
     return Strip(topic.name, tuple(pictures), tuple(problems))
 
 
@@ -148,11 +146,11 @@ def _meters(length: float) -> str:
 
 
 def _jpeg_url(pixels: Pixels) -> str:
-    return _url("jpeg", jpeg_file(fit_pixels(pixels, width=WIDTH, height=HEIGHT), quality=QUALITY))
+    return _url("jpeg", jpeg_file(pixels, quality=QUALITY))
 
 
 def _png_url(pixels: Pixels) -> str:
-    return _url("png", png_bytes(fit_pixels(pixels, width=CLOUD_SIZE, height=CLOUD_SIZE)))
+    return _url("png", png_bytes(pixels))
 
 
 def _url(kind: str, data: bytes) -> str:

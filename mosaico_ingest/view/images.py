@@ -22,8 +22,6 @@ from mosaico_ingest.images.depth import (
 from mosaico_ingest.images.encodings import Pixels, RawImage, demosaic, eight_bits, gray, is_bayer, raw_pixels
 from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
 
-VIDEO = ("h264", "hevc", "h265", "vp9", "av1", "theora")
-"""Formats whose frames depend on earlier frames."""
 _GAP = 4
 """Pixels between the pictures of a contact sheet."""
 _BACKGROUND = 32
@@ -55,7 +53,7 @@ def decode_image(row: Mapping[str, Any], *, ros_format: str = "") -> Pixels:
         raise ViewError("the row contains no image")
     encoding = row.get("encoding")
     if encoding is None:
-        return _compressed_pixels(bytes(data), str(row.get("format") or ""), ros_format)
+        return _compressed_pixels(bytes(data), ros_format)
     if row.get("format") in {None, "", "raw"}:
         return raw_pixels(_raw_image(row, data))
     samples = file_samples(bytes(data))
@@ -152,17 +150,11 @@ def _raw_image(row: Mapping[str, Any], data: bytes | memoryview) -> RawImage:
     )
 
 
-def _compressed_pixels(data: bytes, codec: str, ros_format: str) -> Pixels:
+def _compressed_pixels(data: bytes, ros_format: str) -> Pixels:
     """Return the pixels of an image file or of a compressed depth image."""
     encoding = ros_format.partition(";")[0].strip()
     if "compressedDepth" in ros_format or depth_payload(data) is not None:
         return color_map(_compressed_depth(data, encoding, ros_format))
-    words = {codec.lower(), *ros_format.lower().replace(";", " ").split()}
-    video = next((name for name in VIDEO if name in words), None)
-    if video is not None:
-        raise ViewError(
-            f"{video} is a video stream, whose frames depend on earlier frames", hint="use `ingest view`"
-        )
     return _sample_pixels(file_samples(data), encoding)
 
 

@@ -16,6 +16,7 @@ from mosaico_ingest.images.depth import color_map
 from mosaico_ingest.view.clouds import grid_pixels, has_grid, has_points, row_points
 from mosaico_ingest.view.images import decode_image, has_images
 from mosaico_ingest.view.logs import has_log, log_lines
+from mosaico_ingest.view.pictures import row_codec
 from mosaico_ingest.view.series import plot_fields, read_series
 from mosaico_ingest.view.tracks import has_track, read_track
 
@@ -27,7 +28,8 @@ MAX_PLOTS = 6
 _JPEG_QUALITY = 90
 _DIRECT = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG": "image/png"}
 """Image files that the viewer decodes itself, by their first bytes."""
-_CODECS = {"h264": "H264", "hevc": "H265", "h265": "H265"}
+_CODECS = {"hevc": "H265"}
+"""The viewer's name of each codec for which it has another one."""
 _LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "stale": "WARN", "fatal": "CRITICAL"}
 """The viewer's name of each level that is not INFO."""
 
@@ -124,9 +126,12 @@ class _Sender:
         if has_grid(viewed.topic.schema):
             self._recording.log(path, rerun.Image(grid_pixels(row)))
             return
-        codec = _CODECS.get(str(row.get("format")))
+        codec = row_codec(viewed.topic, row)
         if codec is not None:
-            self._recording.log(path, rerun.VideoStream(getattr(rerun.VideoCodec, codec), sample=data))
+            viewer_codec = getattr(rerun.VideoCodec, _CODECS.get(codec, codec.upper()), None)
+            if viewer_codec is None:
+                raise ViewError(f"this version of the viewer cannot show {codec} video")
+            self._recording.log(path, rerun.VideoStream(viewer_codec, sample=data))
             return
         direct = next((kind for start, kind in _DIRECT.items() if bytes(data[:4]).startswith(start)), None)
         is_color = not any(word in ros_format for word in ("UC1", "FC1", "bayer", "mono16"))
