@@ -24,10 +24,10 @@ class Container(Struct, frozen=True):
     reader: str
     """The class of the reader, as `module:Class`."""
     by_offset: bool = True
-    """Whether the reader reads by offset, so that files behind URLs need not be downloaded.
+    """Whether the reader reads by offset.
 
     If it does, it is called with a `Source` and the maximum decompressed size of a chunk in bytes; otherwise, with the
-    path of a local file and the path to show in messages."""
+    path of a local file and the path to show in messages, or with the `CachedSource` of a file behind a URL."""
 
 
 MCAP = b"\x89MCAP0\r\n"

@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
     from pyarrow.fs import FileInfo, FileSystem
 
+    from mosaico_ingest.web_files import Properties
+
 _REFUSED = re.compile(
     r"ACCESS_DENIED|INVALID_ACCESS_KEY|INVALID_SIGNATURE|INVALID_CLIENT_TOKEN|SIGNATURE_DOES_NOT_MATCH"
     r"|MISSING_AUTHENTICATION|EXPIRED_TOKEN|HTTP status 40[13]|PERMISSION_DENIED|UNAUTHENTICATED|PermissionDenied"
@@ -384,11 +386,27 @@ class RemotePath:
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
 
     def _web_version(self) -> str:
+        properties = self._web_properties(cached=False)
+        return f"{properties.size} {properties.version}"
+
+    @property
+    def has_ranges(self) -> bool:
+        """Whether the server sends ranges of the file.
+
+        Raises:
+            FileNotFoundError: The file does not exist.
+        """
+        if not self.is_web:
+            return True
+        with translate_errors(str(self)):
+            return self._web_properties(cached=True).has_ranges
+
+    def _web_properties(self, *, cached: bool) -> Properties:
         handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - web URLs have a `PyFileSystem`, which has a handler
-        properties = handler.properties(self.filesystem_path, cached=False)
+        properties = handler.properties(self.filesystem_path, cached=cached)
         if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
-        return f"{properties.size} {properties.version}"
+        return properties
 
     def read_bytes(self) -> bytes:
         """Return the content of the object."""

@@ -29,16 +29,19 @@ _MISSING = {404, 410}
 _REFUSED = {401, 403}
 _FRESH_S = 2.0
 """Time for which the properties of a file are cached, since opening a recording asks for them several times."""
+_SKIP_BYTES = 1 << 20
 _BACKOFF_S, _MAX_BACKOFF_S = 0.2, 10.0
 
 
-class _Properties(Struct, frozen=True):
+class Properties(Struct, frozen=True):
     """The properties of a file according to a response."""
 
     size: int
     modified_ns: int | None
     version: str
     """The ETag, or else the time of the last change; empty if the server sends neither."""
+    has_ranges: bool
+    """Whether the server sends ranges; otherwise, it sends the complete file."""
 
 
 class WebFiles(FileSystemHandler):
@@ -47,7 +50,7 @@ class WebFiles(FileSystemHandler):
     def __init__(self, root: str, query: str, network: Network) -> None:
         self._root = root
         self._query = query
-        self._properties: dict[str, tuple[float, _Properties | None]] = {}
+        self._properties: dict[str, tuple[float, Properties | None]] = {}
         retries = urllib3.Retry(
             total=network.attempts - 1,
             status_forcelist=_RETRIED,
@@ -93,7 +96,7 @@ class WebFiles(FileSystemHandler):
             raise self._unreachable(where, f"HTTP status {status}")
         raise IngestError(f"the server responds with HTTP status {status}", where=where, hint="check the URL")
 
-    def properties(self, path: str, *, cached: bool = True) -> _Properties | None:
+    def properties(self, path: str, *, cached: bool = True) -> Properties | None:
         """Return the properties of a file, None if it does not exist."""
         at_s, known = self._properties.get(path, (-_FRESH_S, None))
         if cached and time.monotonic() - at_s < _FRESH_S:
@@ -110,19 +113,16 @@ class WebFiles(FileSystemHandler):
         self._properties[path] = time.monotonic(), properties
         return properties
 
-    def read(self, path: str, start: int, stop: int) -> bytes:
-        """Return a range of a file; if the server ignores ranges, skip the bytes before it."""
-        response, where = self.request(path, start, stop)
+    def read(self, response: Any, where: str, count: int) -> bytes:  # noqa: ANN401 - a response of urllib3
+        """Return the next bytes of a response.
+
+        Raises:
+            Unreachable: The server does not respond in time.
+        """
         try:
-            if response.status == _UNSATISFIABLE:
-                return b""
-            if response.status == _OK:
-                _skip(response, start)
-            return response.read(stop - start)
+            return response.read(count)
         except urllib3.exceptions.HTTPError as error:
             raise self._unreachable(where, type(_cause(error)).__name__) from None
-        finally:
-            _discard(response)
 
     def _unreachable(self, where: str, reason: str) -> Unreachable:
         return Unreachable(
@@ -161,7 +161,7 @@ class WebFiles(FileSystemHandler):
         properties = self.properties(path, cached=False)
         if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), path)
-        return pa.PythonFile(_RangedFile(self, path, properties), mode="r")
+        return pa.PythonFile(_WebFile(self, path, properties), mode="r")
 
     def open_input_stream(self, path: str) -> pa.PythonFile:
         """Open a file for sequential reading."""
@@ -177,15 +177,19 @@ class WebFiles(FileSystemHandler):
     delete_file = move = copy_file = open_output_stream = open_append_stream = _refused
 
 
-class _RangedFile(RawIOBase):
-    """A file that reads each range with one request."""
+class _WebFile(RawIOBase):
+    """A file that reads each range with one request, or consecutive ranges from one response if the server ignores ranges."""
 
-    def __init__(self, files: WebFiles, path: str, properties: _Properties) -> None:
+    def __init__(self, files: WebFiles, path: str, properties: Properties) -> None:
         super().__init__()
         self._files = files
         self._path = path
-        self._size = properties.size
+        self._properties = properties
         self._position = 0
+        self._complete: tuple[Any, str] | None = None
+        """A response with the complete file, and its URL."""
+        self._received = 0
+        """Number of bytes read from the response."""
 
     def readable(self) -> bool:
         return True
@@ -197,20 +201,52 @@ class _RangedFile(RawIOBase):
         return self._position
 
     def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._properties.size}[whence]
         self._position = base + offset
         return self._position
 
     def read(self, size: int | None = -1) -> bytes:
-        end = self._size if size is None or size < 0 else min(self._position + size, self._size)
+        file_size = self._properties.size
+        end = file_size if size is None or size < 0 else min(self._position + size, file_size)
         if end <= self._position:
             return b""
-        data = self._files.read(self._path, self._position, end)
+        data = self._read_range(end) if self._properties.has_ranges else self._read_on(end)
         self._position += len(data)
         return data
 
+    def close(self) -> None:
+        self._drop_response()
+        super().close()
 
-def _properties(response: Any, where: str) -> _Properties:  # noqa: ANN401 - a response of urllib3
+    def _drop_response(self) -> None:
+        if self._complete is not None:
+            _discard(self._complete[0])
+            self._complete = None
+
+    def _read_range(self, end: int) -> bytes:
+        response, where = self._files.request(self._path, self._position, end)
+        try:
+            if response.status == _UNSATISFIABLE:
+                return b""
+            return self._files.read(response, where, end - self._position)
+        finally:
+            _discard(response)
+
+    def _read_on(self, end: int) -> bytes:
+        """Read from the response with the complete file; request it again if its position is after the range."""
+        if self._received > self._position:
+            self._drop_response()
+        if self._complete is None:
+            self._complete, self._received = self._files.request(self._path, 0, end), 0
+        while self._received < self._position:
+            skipped_bytes = min(self._position - self._received, _SKIP_BYTES)
+            self._received += len(self._files.read(*self._complete, skipped_bytes))
+        data = self._files.read(*self._complete, end - self._position)
+        self._received += len(data)
+        return data
+
+
+def _properties(response: Any, where: str) -> Properties:  # noqa: ANN401 - a response of urllib3
     headers = response.headers
     if response.status == _OK:
         total = headers.get("Content-Length", "")
@@ -227,12 +263,9 @@ def _properties(response: Any, where: str) -> _Properties:  # noqa: ANN401 - a r
         )
     except ValueError:
         modified_ns = None
-    return _Properties(int(total), modified_ns, headers.get("ETag") or last_modified or "")
-
-
-def _skip(response: Any, count: int) -> None:  # noqa: ANN401 - a response of urllib3
-    while count and (chunk := response.read(min(count, 1 << 20))):
-        count -= len(chunk)
+    return Properties(
+        int(total), modified_ns, headers.get("ETag") or last_modified or "", has_ranges=response.status != _OK
+    )
 
 
 def _discard(response: Any) -> None:  # noqa: ANN401 - a response of urllib3

@@ -42,6 +42,7 @@ from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
+from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.report.events import Event, Rejected
 from mosaico_ingest.rosbag.blocks import MessageBlock
@@ -122,7 +123,7 @@ def _share(plan: Plan) -> float:
 MESSAGES = 16
 """Number of messages per topic in the sample."""
 _MEMORY_BYTES = 32 << 20
-_SAMPLE_BYTES = 64 << 20
+_SAMPLE_BYTES, _REMOTE_SAMPLE_BYTES = 64 << 20, 4 << 20
 """Bytes read to find the messages of the sample; topics that are still missing are then read by the index."""
 _SAMPLE_S = 5.0
 
@@ -210,13 +211,16 @@ def _blocks(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iter
 def _sample_blocks(
     plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int
 ) -> Iterator[MessageBlock]:
-    remaining_bytes, deadline = _SAMPLE_BYTES, time.monotonic() + _SAMPLE_S
+    is_remote = any(isinstance(path, RemotePath) for path in recording.files)
+    remaining_bytes = _REMOTE_SAMPLE_BYTES if is_remote else _SAMPLE_BYTES
+    deadline = time.monotonic() + _SAMPLE_S
+    memory_bytes = min(remaining_bytes, _MEMORY_BYTES)
     blocks = recording.message_blocks(
         tuple(trials),
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
         max_rows=MESSAGES,
-        memory_bytes=_MEMORY_BYTES,
+        memory_bytes=memory_bytes,
     )
     for block in blocks:
         remaining_bytes -= int(block.lengths.sum())

@@ -177,6 +177,8 @@ class ReadRequest(Struct, frozen=True):
     end_ns: int
     block_bytes: int
     """Approximate number of bytes to read per task."""
+    block_rows: int
+    """Maximum number of messages to read per task, if the container is read message by message."""
 
     def overlaps(self, first_ns: int, last_ns: int) -> bool:
         """Return whether a log time between the two, both inclusive, may be requested."""

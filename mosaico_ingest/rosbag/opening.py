@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections.abc import Callable
 from contextlib import ExitStack
+from importlib.util import find_spec
 from pathlib import Path
 from pkgutil import resolve_name
 from stat import S_ISREG
@@ -14,7 +15,7 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.blocks import SplitReader, UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_file
-from mosaico_ingest.rosbag.source import FileSource, RemoteSource, download
+from mosaico_ingest.rosbag.source import CachedSource, FileSource, RemoteSource, download
 
 _HEAD_BYTES = 16
 
@@ -43,12 +44,16 @@ def open_split(path: AnyPath, stack: ExitStack, *, max_chunk_bytes: int = MAX_CH
 
 
 def _open_remote(path: RemotePath, stack: ExitStack, max_chunk_bytes: int) -> SplitReader:
-    """Open a remote file in place; download it if its format cannot be read by offset."""
+    """Open a remote file in place; download it if it cannot be read by range."""
     source = RemoteSource(path)
     head = source.read_some(0, _HEAD_BYTES)
     container = container_of(head)
-    if container is not None and container.by_offset:
+    if container is not None and container.by_offset and source.has_ranges:
         return _opened(container, path, stack, source, max_chunk_bytes)
+    logs = [log for log in _log_paths(path) if log.is_file()]
+    reason = _download_reason(source, container, logs)
+    if container is not None and reason is None:
+        return _opened(container, path, stack, CachedSource(source))
     source.close()
     if container is None and not head.startswith(ZSTD):
         raise _not_a_recording(head, path)
@@ -58,14 +63,29 @@ def _open_remote(path: RemotePath, stack: ExitStack, max_chunk_bytes: int) -> Sp
         split = _open_compressed(copy, path, stack, max_chunk_bytes)
         copy.unlink()
     else:
-        for log in (
-            () if path.is_web else (path.parent / f"{path.name}{suffix}" for suffix in ("-wal", "-journal"))
-        ):
-            if log.is_file():
-                download(log, folder)
+        for log in logs:
+            download(log, folder)
         split = _open_local(copy, path, head, stack, max_chunk_bytes)
-    split.notes.append(f"its format cannot be read in place, so all {source.size} bytes were downloaded")
+    split.notes.append(f"{reason}, so all {source.size} bytes were downloaded")
     return split
+
+
+def _log_paths(path: RemotePath) -> list[RemotePath]:
+    """Return the paths of the logs that SQLite may have left next to a file."""
+    return [] if path.is_web else [path.parent / f"{path.name}{suffix}" for suffix in ("-wal", "-journal")]
+
+
+def _download_reason(source: RemoteSource, container: Container | None, logs: list[RemotePath]) -> str | None:
+    """Return why a file must be downloaded, None if its pages can be read by range."""
+    if container is None:
+        return "it is compressed"
+    if not source.has_ranges:
+        return "the server ignores ranges"
+    if logs:
+        return f"{logs[0].name} must be replayed"
+    if find_spec("apsw") is None:
+        return "the extra mosaico-ingest[remote] is not installed"
+    return None
 
 
 def _open_compressed(path: Path, name: AnyPath, stack: ExitStack, max_chunk_bytes: int) -> SplitReader:

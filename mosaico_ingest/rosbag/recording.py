@@ -296,7 +296,7 @@ class Recording:
         first = EARLIEST_NS if start_ns is None else start_ns
         end = LATEST_NS + 1 if end_ns is None else end_ns
         requests = {
-            number: ReadRequest(keys, first, end, memory_bytes // _BLOCKS_IN_MEMORY)
+            number: ReadRequest(keys, first, end, memory_bytes // _BLOCKS_IN_MEMORY, max_rows)
             for number in range(len(self._splits))
             if (keys := self._table.split_connections(number, ids))
         }

@@ -289,6 +289,8 @@ _MAX_GAP_BYTES = 512 << 10
 """Maximum gap between two ranges that are fetched with one request."""
 _CONCURRENT_REQUESTS = 4
 """Maximum number of concurrent requests; their responses take at most 32 MiB."""
+_LARGEST_WINDOW = _CONCURRENT_REQUESTS * _REQUEST_BYTES // _PAGE_BYTES
+"""Number of pages that a scan fetches together: as many as all concurrent requests return."""
 
 
 class _Range(Struct, frozen=True):
@@ -317,6 +319,8 @@ class RemoteSource:
         self._pages: deque[_Range] = deque(maxlen=_CACHED_PAGES)
         try:
             self._file = path.open_input()
+            self.has_ranges = path.has_ranges
+            """Whether the server sends ranges; otherwise, each range costs the bytes before it."""
             with translate_errors(str(path)):
                 self.size: int = self._file.size()
                 self._version = path.version(self._file)
@@ -349,7 +353,7 @@ class RemoteSource:
         """Start to fetch the ranges (start, end) that will be read next, in this order."""
         self._stop_prefetching()
         if self._copy is None:
-            self._prefetcher = _Prefetcher(self._fetch, _requests(iter(ranges)))
+            self._prefetcher = _Prefetcher(self.fetch, _requests(iter(ranges)))
 
     def fetch_whole(self) -> None:
         """Download the complete file to a temporary folder, for many small reads; `close` removes it."""
@@ -388,12 +392,13 @@ class RemoteSource:
             if page.has(start, stop):
                 return page.cut(start, stop)
         first = max(0, min(start, self.size - _PAGE_BYTES))
-        page = _Range(first, self._fetch(first, max(stop, min(first + _PAGE_BYTES, self.size))))
+        page = _Range(first, self.fetch(first, max(stop, min(first + _PAGE_BYTES, self.size))))
         if len(page.data) <= _PAGE_BYTES:
             self._pages.append(page)
         return page.cut(start, stop)
 
-    def _fetch(self, start: int, stop: int) -> bytes:
+    def fetch(self, start: int, stop: int) -> bytes:
+        """Fetch a range with one request."""
         try:
             with translate_errors(str(self.path)):
                 data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs lack the arguments
@@ -408,6 +413,73 @@ class RemoteSource:
                 f"{stop - start} bytes expected at {start}, {len(data)} received", where=str(self.path)
             )
         return data
+
+
+class CachedSource:
+    """A remote file whose pages are cached in a temporary file, for readers that read pages more than once.
+
+    Sequential misses double the number of pages per miss, so that a scan needs few requests, and a single page costs one
+    small request.
+    """
+
+    def __init__(self, source: RemoteSource) -> None:
+        """Take over a source; `close` closes it."""
+        self.path = source.path
+        self.size = source.size
+        self._source = source
+        self._cached = bytearray(-(-self.size // _PAGE_BYTES))
+        """Whether each page is in the cache, as 0 or 1."""
+        self._window = 1
+        """Number of pages that the last sequential miss fetched."""
+        self._folder = tempfile.TemporaryDirectory(prefix="mosaico-")
+        self._output = Path(self._folder.name, "pages").open("wb", buffering=0)  # noqa: SIM115 - `close` closes it
+        self._output.truncate(self.size)  # the file is sparse: pages take space when they are written
+        self._cache = FileSource(Path(self._output.name), self.path)
+
+    def read_some(self, offset: int, size: int) -> bytes:
+        """Return up to `size` bytes from `offset`; fewer only at the end of the file."""
+        stop = min(offset + size, self.size)
+        for page in range(offset // _PAGE_BYTES, -(-stop // _PAGE_BYTES)):
+            if not self._cached[page]:
+                self._load(page)
+        return self._cache.read_some(offset, size)
+
+    def check_unchanged(self) -> None:
+        """Raise Unreachable if the file has been replaced since it was opened."""
+        self._source.check_unchanged()
+
+    def close(self) -> None:
+        """Close the file and remove the cache. Closing twice is harmless."""
+        self._source.close()
+        self._cache.close()
+        self._output.close()
+        self._folder.cleanup()
+
+    def _load(self, page: int) -> None:
+        """Fetch a page; after the page before it, fetch twice as many as at the last time."""
+        is_sequential = page > 0 and self._cached[page - 1]
+        if is_sequential:
+            self._window = min(2 * self._window, _LARGEST_WINDOW)
+        limit = min(page + (self._window if is_sequential else 1), len(self._cached))
+        end = next((number for number in range(page, limit) if self._cached[number]), limit)
+        stop = min(end * _PAGE_BYTES, self.size)
+        starts = range(page * _PAGE_BYTES, stop, _REQUEST_BYTES)
+        stops = [min(start + _REQUEST_BYTES, stop) for start in starts]
+        with ThreadPoolExecutor(_CONCURRENT_REQUESTS, thread_name_prefix="mosaico-fetch") as pool:
+            for start, data in zip(starts, pool.map(self._source.fetch, starts, stops), strict=True):
+                self._write(start, data)
+        self._cached[page:end] = bytes([1]) * (end - page)
+
+    def _write(self, start: int, data: bytes) -> None:
+        try:
+            self._output.seek(start)
+            self._output.write(data)
+        except OSError as err:
+            raise BagError(
+                f"cannot be cached in {self._folder.name}: {err.strerror}",
+                where=str(self.path),
+                hint="point TMPDIR at a larger disk",
+            ) from err
 
 
 class _Prefetcher:
@@ -498,7 +570,8 @@ def _save(source: RemoteSource, folder: Path) -> Path:
         )
     target = folder / source.path.name
     steps = [(at, min(at + _REQUEST_BYTES, source.size)) for at in range(0, source.size, _REQUEST_BYTES)]
-    source.prefetch(steps)
+    if source.has_ranges:
+        source.prefetch(steps)
     try:
         with target.open("wb") as file:
             for start, stop in steps:

@@ -11,6 +11,9 @@ they disagree, `PRAGMA quick_check` decides whether the file is damaged or rows 
 
 If SQLite reports damage, a result that looks complete may contain wrong values, so it has an unreadable range of unknown
 size. Only bytes of values that changed in place remain unnoticed.
+
+A file behind a URL is read by range (`remote_sqlite`). Counting its rows would read most of it, so the rows are counted after
+they have been read, and the pages of the complete file are checked only if all messages have been read.
 """
 
 from __future__ import annotations
@@ -24,7 +27,7 @@ from collections.abc import Collection, Iterator, Sequence
 from contextlib import ExitStack
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from msgspec import Struct
@@ -49,6 +52,7 @@ from mosaico_ingest.rosbag.blocks import (
     undescribed_connections,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
+from mosaico_ingest.rosbag.source import CachedSource
 
 DAMAGE = (sqlite3.Error, UnicodeDecodeError, MemoryError, OverflowError)
 """Exceptions that damage causes: damaged names in SQLite's messages, and damaged sizes, have no exception of their own."""
@@ -57,10 +61,32 @@ Row = tuple[Any, Any, Any, Any]
 """Row id, topic id, timestamp, payload. SQLite stores values of any type in any column, so each row is checked."""
 _ROW_TYPES = [int, int, int, bytes]
 _MAX_ROWID = 2**63 - 1
+_HEAD_BYTES = 18
+"""Size of the start of the header, up to the page size."""
 _MAX_PAGE_ROWS = 1 << 16
 _MAX_BITMAP_ROWS = 1 << 28
 _EVENT = "_Event"
 """Suffix of the type of service events; their definition is stored under the name of the service."""
+
+
+class Cursor(Protocol):
+    """The rows of a query."""
+
+    def __iter__(self) -> Iterator[Any]:
+        """Return the iterator over the remaining rows."""
+        ...
+
+    def fetchone(self) -> Any:  # noqa: ANN401 - SQLite stores values of any type in any column
+        """Return the next row, None after the last."""
+        ...
+
+
+class Database(Protocol):
+    """The interface of `sqlite3.Connection` that the reader uses; queries raise an error of `DAMAGE`."""
+
+    def execute(self, query: str, parameters: Sequence[int] = (), /) -> Cursor:
+        """Run a query."""
+        ...
 
 
 class SqliteReader:
@@ -68,16 +94,19 @@ class SqliteReader:
 
     container = "sqlite3"
 
-    def __init__(self, path: Path, name: AnyPath | None = None) -> None:
-        self.path: AnyPath = name or path
+    def __init__(self, file: Path | CachedSource, name: AnyPath | None = None) -> None:
+        self._source = None if isinstance(file, Path) else file
+        self.path: AnyPath = name or (file if isinstance(file, Path) else file.path)
         self.unreadable: list[UnreadableRange] = []
         self.notes: list[str] = []
         self._stack = ExitStack()
         try:
-            self._database = _open_database(path, self._stack, self.notes)
+            self._database: Database = (
+                _open_database(file, self._stack, self.notes)
+                if isinstance(file, Path)
+                else _open_by_range(file, self._stack)
+            )
             self._columns = _read_columns(self._database)
-            self._totals = _read_totals(self._database)
-            self._counts = self._totals.by_topic if self._totals.damage is None else None
             self.connections: tuple[SplitConnection, ...] = self._read_connections()
             self.start_ns, self.end_ns = self._read_time_bounds()
         except (*DAMAGE, OSError, TypeError, ValueError) as err:
@@ -86,41 +115,41 @@ class SqliteReader:
         except BaseException:
             self._stack.close()
             raise
-        self.message_count: int | None = None if self._counts is None else self._totals.table_rows
-        if self._totals.damage is not None:
-            self.notes.append(f"the file is damaged and read row by row: {self._totals.damage}")
-        described = {connection.id for connection in self.connections}
-        self.unreadable += undescribed_connections(self._counts, described)
-        if self._counts is not None and self._totals.untyped_rows:
-            reason = f"{self._totals.untyped_rows} rows whose topic id is not an integer"
-            self.unreadable.append(UnreadableRange(0, reason, count=self._totals.untyped_rows))
+        self.message_count: int | None = None
+        if self._source is None:
+            self.message_count = None if self._counts is None else self._totals.table_rows
+            if self._totals.damage is not None:
+                self.notes.append(f"the file is damaged and read row by row: {self._totals.damage}")
+            self.unreadable += self._rows_without_connection()
 
     def read_tasks(self, request: ReadRequest) -> Iterator[ReadTask]:
         """Yield pages of rows by timestamp; in case of damage, the remaining rows by row id."""
-        rows_read = _RowSet(self._totals.first_rowid, self._totals.last_rowid)
-        damage = self._totals.damage
+        rows_read = _RowSet(*self._rowid_bounds)
+        damage = self._totals.damage if self._source is None else None
         last_ns = EARLIEST_NS
         if damage is None:
             bounds = (max(request.start_ns, EARLIEST_NS), min(request.end_ns - 1, LATEST_NS))
             try:
-                for page in _pages(self._database.execute(_query(request), bounds), request):
+                matches = iter(self._database.execute(_query(request), bounds))
+                # A local file is read in large pages, which cost less; a reader behind a URL may stop early.
+                max_rows = _MAX_PAGE_ROWS if self._source is None else request.block_rows
+                for page in _pages(matches, request, max_rows=max_rows):
                     rows = rows_read.add(page)
                     last_ns = max(last_ns, _first_time(rows, default=last_ns))
                     yield ReadTask(_first_time(rows, default=last_ns), partial(_load, rows))
             except DAMAGE as err:
                 damage = str(err)
             else:
-                if any(self._missing_rows(request, rows_read).values()):
-                    damage = "the index on the timestamp is damaged"
-                else:
-                    damage = self._hidden_damage
-                if damage is None:
-                    return
-        yield from self._remaining_tasks(request, rows_read, damage, last_ns)
+                damage = self._damage_after_reading(request, rows_read)
+            if self._source is not None and _is_unlimited(request):
+                unreadable = self._rows_without_connection()
+                yield ReadTask(last_ns, lambda: ReadResult([], unreadable))
+        if damage is not None:
+            yield from self._remaining_tasks(request, rows_read, damage, last_ns)
 
     def index_times(self, connections: Collection[int]) -> dict[int, list[Int64s]] | None:
         """Return the log times of some connections; None if the file is damaged."""
-        if self._totals.damage is not None:
+        if self._source is None and self._totals.damage is not None:
             return None
         try:
             rows = np.fromiter(
@@ -133,6 +162,45 @@ class SqliteReader:
         for key, positions in rows_by_connection(rows["topic"]):
             times[key] = [rows["time"][positions]]
         return times
+
+    @cached_property
+    def _totals(self) -> _Totals:
+        return _read_totals(self._database)
+
+    @property
+    def _counts(self) -> dict[int, int] | None:
+        """The number of rows by topic, None if they cannot be counted."""
+        return self._totals.by_topic if self._totals.damage is None else None
+
+    @cached_property
+    def _rowid_bounds(self) -> tuple[int, int]:
+        try:
+            return _read_rowid_bounds(self._database)
+        except (*DAMAGE, TypeError, ValueError):
+            return 0, -1
+
+    def _rows_without_connection(self) -> list[UnreadableRange]:
+        """Return the rows whose topic is unknown."""
+        if self._counts is None:
+            return []
+        rows = undescribed_connections(self._counts, {connection.id for connection in self.connections})
+        if self._totals.untyped_rows:
+            reason = f"{self._totals.untyped_rows} rows whose topic id is not an integer"
+            rows.append(UnreadableRange(0, reason, count=self._totals.untyped_rows))
+        return rows
+
+    def _damage_after_reading(self, request: ReadRequest, rows_read: _RowSet) -> str | None:
+        """Return damage that reading a request did not reveal; check a file behind a URL only as far as it was read."""
+        is_range = self._source is not None
+        if is_range and not _is_unlimited(request):
+            return None
+        if self._totals.damage is not None:
+            return self._totals.damage
+        if any(self._missing_rows(request, rows_read).values()):
+            return "the index on the timestamp is damaged"
+        if is_range and not {connection.id for connection in self.connections} <= set(request.connections):
+            return None
+        return self._hidden_damage
 
     @cached_property
     def _hidden_damage(self) -> str | None:
@@ -150,7 +218,9 @@ class SqliteReader:
         return {ROSBAG2_RECORD: {ROSBAG2_ENTRY: row[0]}}
 
     def check_unchanged(self) -> None:
-        """Do nothing; see `FileSource.check_unchanged`."""
+        """Raise Unreachable if a file behind a URL has been replaced since it was opened."""
+        if self._source is not None:
+            self._source.check_unchanged()
 
     def close(self) -> None:
         """Close the file, and remove a temporary copy."""
@@ -173,7 +243,7 @@ class SqliteReader:
         self, request: ReadRequest, rows_read: _RowSet, scan: RowScan, damage: str
     ) -> list[UnreadableRange]:
         """Return the missing rows: per connection if the counts are reliable, else in total or per gap."""
-        if self._counts is not None and _is_unlimited(request):
+        if _is_unlimited(request) and self._counts is not None:
             offset = scan.gaps[0].offset if scan.gaps else 0
             missing = [
                 UnreadableRange(offset, f"{damage}: {count} rows are missing", connection=key, count=count)
@@ -192,7 +262,7 @@ class SqliteReader:
 
     def _missing_rows(self, request: ReadRequest, rows_read: _RowSet) -> dict[int, int]:
         """Return the number of missing rows by topic; empty if the request is limited in time."""
-        if self._counts is None or not _is_unlimited(request):
+        if not _is_unlimited(request) or self._counts is None:
             return {}
         return {
             key: self._counts.get(key, 0) - rows_read.by_topic[key] for key in sorted(request.connections)
@@ -209,28 +279,32 @@ class SqliteReader:
             "type_description_hash",
         )
         present = [name for name in names if name in self._columns.topics]
-        rows = self._database.execute(f"SELECT {','.join(present)} FROM topics ORDER BY id")  # noqa: S608 - constants
+        # Text that is read as bytes may be invalid UTF-8.
+        columns = ["id", *(f"CAST({name} AS BLOB)" for name in present[1:])]
+        rows = self._database.execute(f"SELECT {','.join(columns)} FROM topics ORDER BY id")  # noqa: S608 - constants
         topics = [dict(zip(present, row, strict=True)) for row in rows]
         invalid = [topic for topic in topics if not isinstance(topic["id"], int)]
         if invalid:
             reason = f"{len(invalid)} rows of the table `topics` have no integer id"
             self.unreadable.append(UnreadableRange(0, reason))
         by_id = {topic["id"]: topic for topic in topics if isinstance(topic["id"], int)}
-        return tuple(_connection(topic, self._counts, definitions) for topic in by_id.values())
+        counts = self._counts if self._source is None else None
+        return tuple(_connection(topic, counts, definitions) for topic in by_id.values())
 
     def _read_definitions(self) -> dict[str, Embedded]:
         if not self._columns.has_definitions:
             return {}
-        query = "SELECT topic_type, encoding, encoded_message_definition FROM message_definitions ORDER BY id DESC"
+        columns = ("topic_type", "encoding", "encoded_message_definition")
+        query = f"SELECT {','.join(f'CAST({name} AS BLOB)' for name in columns)} FROM message_definitions ORDER BY id DESC"  # noqa: S608 - constants
         return {
-            str(name): Embedded(str(encoding), _text(text))
+            _text(name): Embedded(_text(encoding), _text(text))
             for name, encoding, text in self._database.execute(query)
         }
 
     def _read_time_bounds(self) -> tuple[int | None, int | None]:
         try:
             first, last = self._database.execute(
-                "SELECT min(timestamp), max(timestamp) FROM messages"
+                "SELECT (SELECT min(timestamp) FROM messages), (SELECT max(timestamp) FROM messages)"
             ).fetchone()
         except DAMAGE as err:
             self.notes.append(f"the first and last timestamps cannot be read: {err}")
@@ -248,7 +322,7 @@ class RowScan:
     Rows of a damaged table may be out of order or repeated.
     """
 
-    def __init__(self, database: sqlite3.Connection) -> None:
+    def __init__(self, database: Database) -> None:
         self._database = database
         self.gaps: list[UnreadableRange] = []
         """The rows that SQLite failed to read."""
@@ -366,7 +440,7 @@ class _Totals(Struct, frozen=True):
         return self.last_rowid - self.first_rowid + 1
 
 
-def _read_totals(database: sqlite3.Connection) -> _Totals:
+def _read_totals(database: Database) -> _Totals:
     """Count the messages in three ways, and check the file if the results differ."""
     damage: str | None = None
     by_topic: dict[Any, int] = {}
@@ -377,10 +451,8 @@ def _read_totals(database: sqlite3.Connection) -> _Totals:
         by_topic = dict(database.execute(query))
         table_rows = sum(by_topic.values())
         (index_rows,) = database.execute("SELECT count(*) FROM messages").fetchone()
-        query = "SELECT (SELECT min(rowid) FROM messages), (SELECT max(rowid) FROM messages)"
-        bounds = database.execute(query).fetchone()
         if table_rows or index_rows:
-            first_rowid, last_rowid = map(int, bounds)
+            first_rowid, last_rowid = _read_rowid_bounds(database)
     except (*DAMAGE, TypeError, ValueError) as err:
         damage = f"the messages cannot be counted: {err}"
     else:
@@ -393,7 +465,13 @@ def _read_totals(database: sqlite3.Connection) -> _Totals:
     return _Totals(typed, table_rows, untyped_rows, index_rows, first_rowid, last_rowid, damage)
 
 
-def _check(database: sqlite3.Connection, check: str) -> str | None:
+def _read_rowid_bounds(database: Database) -> tuple[int, int]:
+    query = "SELECT (SELECT min(rowid) FROM messages), (SELECT max(rowid) FROM messages)"
+    first, last = database.execute(query).fetchone()
+    return int(first), int(last)
+
+
+def _check(database: Database, check: str) -> str | None:
     """Return the first problem that `quick_check` or `integrity_check` finds in the file, None if it finds none."""
     try:
         (result,) = database.execute(f"PRAGMA {check}(1)").fetchone()
@@ -405,8 +483,10 @@ def _check(database: sqlite3.Connection, check: str) -> str | None:
 def _open_database(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Connection:
     """Open a file read-only; open a copy if a log must be replayed or if the last page is incomplete."""
     logs = [log for suffix in ("-wal", "-journal") if _has_bytes(log := Path(f"{path}{suffix}"))]
-    page_bytes = _complete_pages(path)
-    if logs or page_bytes < path.stat().st_size:
+    size = path.stat().st_size
+    with path.open("rb") as file:
+        page_bytes = _complete_pages(file.read(_HEAD_BYTES), size)
+    if logs or page_bytes < size:
         folder = Path(stack.enter_context(tempfile.TemporaryDirectory(prefix="mosaico-")))
         for file in (path, *logs):
             shutil.copyfile(file, folder / file.name)
@@ -421,11 +501,16 @@ def _open_database(path: Path, stack: ExitStack, notes: list[str]) -> sqlite3.Co
     return database
 
 
-def _complete_pages(path: Path) -> int:
+def _open_by_range(source: CachedSource, stack: ExitStack) -> Database:
+    from mosaico_ingest.rosbag.remote_sqlite import RemoteDatabase  # noqa: PLC0415 - an optional dependency
+
+    stack.callback(source.close)
+    return RemoteDatabase(source, stack, size=_complete_pages(source.read_some(0, _HEAD_BYTES), source.size))
+
+
+def _complete_pages(head: bytes, size: int) -> int:
     """Return the size of the complete pages in bytes: SQLite would read missing bytes of the last page as zeros."""
-    size = path.stat().st_size
-    with path.open("rb") as file:
-        page_bytes = int.from_bytes(file.read(18)[16:], "big")
+    page_bytes = int.from_bytes(head[16:18], "big")
     page_bytes = 1 << 16 if page_bytes == 1 else page_bytes
     return size - size % page_bytes if page_bytes else size
 
@@ -438,7 +523,7 @@ def _text(value: object) -> str:
     return value.decode("utf-8", "replace") if isinstance(value, bytes) else str(value)
 
 
-def _read_tables(database: sqlite3.Connection) -> set[str]:
+def _read_tables(database: Database) -> set[str]:
     """Return the names of the tables, also of a truncated file."""
     query = "SELECT name FROM sqlite_master WHERE type = 'table'"
     try:
@@ -449,7 +534,7 @@ def _read_tables(database: sqlite3.Connection) -> set[str]:
         return {str(name) for (name,) in database.execute(query)}
 
 
-def _read_columns(database: sqlite3.Connection) -> _Columns:
+def _read_columns(database: Database) -> _Columns:
     tables = _read_tables(database)
     if not {"topics", "messages"} <= tables:
         raise BagError(
@@ -466,14 +551,14 @@ def _read_columns(database: sqlite3.Connection) -> _Columns:
 def _connection(
     topic: dict[str, Any], counts: dict[int, int] | None, definitions: dict[str, Embedded]
 ) -> SplitConnection:
-    encoding, msgtype = str(topic.get("serialization_format", "cdr")), str(topic["type"])
+    encoding, msgtype = _text(topic.get("serialization_format", "cdr")), _text(topic["type"])
     attributes = {"encoding": encoding}
     for name in ("offered_qos_profiles", "type_description_hash"):
         if topic.get(name):
-            attributes[name] = str(topic[name])
+            attributes[name] = _text(topic[name])
     return SplitConnection(
         topic["id"],
-        str(topic["name"]),
+        _text(topic["name"]),
         msgtype,
         Encoding.CDR if encoding == "cdr" else Encoding.OTHER,
         2,
@@ -506,9 +591,11 @@ def _is_requested(row: Row, request: ReadRequest) -> bool:
     return not isinstance(row[2], int) or request.start_ns <= row[2] < request.end_ns
 
 
-def _pages(rows: Iterator[Row], request: ReadRequest) -> Iterator[list[Row]]:
+def _pages(
+    rows: Iterator[Row], request: ReadRequest, *, max_rows: int = _MAX_PAGE_ROWS
+) -> Iterator[list[Row]]:
     """Yield lists of rows of about the requested size."""
-    return group_by_bytes(rows, _payload_bytes, request.block_bytes, max_length=_MAX_PAGE_ROWS)
+    return group_by_bytes(rows, _payload_bytes, request.block_bytes, max_length=max_rows)
 
 
 def _payload_bytes(row: Row) -> int:

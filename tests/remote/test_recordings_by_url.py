@@ -106,11 +106,8 @@ def test_recording_by_url_equals_the_file(objects: ObjectStore, small: Path) -> 
     with opened(small) as here, opened(path) as there:
         assert messages(there) == messages(here)
         assert there.unreadable == here.unreadable == ()
-        assert (there.message_count, there.start_ns, there.end_ns) == (
-            here.message_count,
-            here.start_ns,
-            here.end_ns,
-        )
+        assert there.message_count == (None if small.suffix == ".db3" else here.message_count)
+        assert (there.start_ns, there.end_ns) == (here.start_ns, here.end_ns)
         assert there.size_bytes == small.stat().st_size
 
 
@@ -133,10 +130,11 @@ def test_recording_without_ranges_is_downloaded_and_removed(
 def test_recording_larger_than_the_temporary_folder_is_refused(
     objects: ObjectStore, folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    file = record(folder / "no_room.db3", [("/a", FLOAT, START_NS, {"data": 1.0})])
-    path = put(objects, file, "no_room.db3")
+    packed = folder / "no_room.db3.zstd"
+    packed.write_bytes(zstandard.compress(b"content"))
+    path = put(objects, packed, packed.name)
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10, 10, 0))
-    with pytest.raises(BagError, match=r"no_room.db3: \d+ bytes .* only 0 are free"):
+    with pytest.raises(BagError, match=r"no_room.db3.zstd: \d+ bytes .* only 0 are free"):
         opened(path)
 
 
@@ -251,8 +249,6 @@ def test_missing_recording_is_an_error_that_names_it(objects: ObjectStore) -> No
 
 
 def test_recording_that_changes_while_it_is_read_is_an_error(objects: ObjectStore, small: Path) -> None:
-    if small.suffix == ".db3":
-        return
     path = put(objects, small, f"changing/{small.name}")
     with opened(path) as there:
         path.write_bytes(small.read_bytes()[:-1] + b"!")
@@ -295,8 +291,7 @@ def test_the_ledger_knows_a_recording_by_what_its_store_says(
     assert report.exit_code == 0, report.error
     objects.counts()
     assert standing() == "done"
-    if small.suffix != ".db3":  # that one is fetched to be looked into
-        assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
+    assert sum(line.startswith("GET /bucket/ledger") for line in objects.counts().requests) <= 4
     path.write_bytes(small.read_bytes() + b"\n")
     assert standing() in {"changed", "unreadable"}
 

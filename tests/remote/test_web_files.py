@@ -13,7 +13,7 @@ from web_server import WebServer, web_server
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.errors import BagError, IngestError, ManifestError, NothingMatched, Unreachable
+from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched, Unreachable
 from mosaico_ingest.findings import mask_credentials
 from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
@@ -134,14 +134,6 @@ def test_expired_url_fails_with_hint_and_without_query(
     assert status is RunStatus.FAILED
     assert "HTTP status 403" in error
     assert SECRET not in error
-
-
-def test_download_larger_than_the_limit_is_refused(server: WebServer, tmp_path: Path) -> None:
-    path = record(tmp_path / "a.db3", [("/blob", BLOB, 1, {"data": [1] * (1 << 20)})])
-    server.files["a.db3"] = path.read_bytes()
-    network = Network(max_download_bytes=1 << 20)
-    with pytest.raises(BagError, match="max_download"):
-        open_recording(remote(server, "a.db3", network), resolve=TypeResolver(None))
 
 
 def test_changed_file_is_not_read_further(server: WebServer) -> None:
