@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
@@ -20,6 +20,7 @@ from mosaico_ingest.job.expect import (
 )
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
+from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 if TYPE_CHECKING:
     from mosaico_ingest.ontology.types import OntologyType
@@ -196,6 +197,12 @@ def _full_form(key: str, value: Any) -> Any:  # noqa: ANN401 - any form of an ex
     if key == "stamps":
         return StampOrder(order=value)
     return value
+
+
+def other_types(expected: AllowedNames, msgtypes: Iterable[str]) -> list[str]:
+    """Return the message types that an expectation does not allow; `pkg/Name` of ROS 1 is `pkg/msg/Name`."""
+    allowed = set(map(normalize_msgtype, expected.one_of))
+    return [name for name in msgtypes if normalize_msgtype(name) not in allowed]
 
 
 def occurrence(

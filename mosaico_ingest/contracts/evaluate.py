@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mosaico_ingest.contracts import texts
-from mosaico_ingest.contracts.clauses import HEADER_KEYS, Clause, Contract, occurrence
+from mosaico_ingest.contracts.clauses import HEADER_KEYS, Clause, Contract, occurrence, other_types
 from mosaico_ingest.contracts.monitor import TopicMonitor
 from mosaico_ingest.contracts.order import FileOrder
 from mosaico_ingest.contracts.recorder import RecorderEvents, Windows, covered_ns, uncovered_ns
@@ -21,7 +21,6 @@ from mosaico_ingest.job.values import RECORDING, Limit
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import count_text, counted
-from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 
 class TopicFacts:
@@ -195,11 +194,8 @@ def _topic_result(clause: Clause, topic: TopicFacts, facts: Facts) -> Expectatio
 
 
 def _type_result(clause: Clause, topic: TopicFacts) -> ExpectationResult:
-    allowed = clause.expected.one_of
-    wrong = [
-        name for name in topic.msgtypes if normalize_msgtype(name) not in set(map(normalize_msgtype, allowed))
-    ]
-    limit = " or ".join(allowed)
+    wrong = other_types(clause.expected, topic.msgtypes)
+    limit = " or ".join(clause.expected.one_of)
     measured = ", ".join(topic.msgtypes)
     return _result(
         clause, not wrong, f"the type is {measured}; expected {limit}", measured=measured, limit=limit

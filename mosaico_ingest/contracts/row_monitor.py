@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.columns import Array
-from mosaico_ingest.contracts.clauses import HEADER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic
+from mosaico_ingest.contracts.clauses import HEADER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic, other_types
 from mosaico_ingest.contracts.expressions import (
     Evaluator,
     FieldExpression,
@@ -204,6 +204,8 @@ def check_expressions(
 ) -> None:
     """Check the expressions of a contract against the message types of the topics that they apply to.
 
+    A message type that violates the expectation `type` is not checked: its expressions are not evaluated.
+
     Raises:
         ManifestError: An expression has a mistake; `findings` has all of them, with their locations.
     """
@@ -222,7 +224,10 @@ def _expression_findings(
     by_id = {connection.id: connection for connection in connections}
     findings: dict[Finding, None] = {}
     for topic in topics:
+        of_type = contract.topic_clauses(topic.topic).get("type")
         for key in topic.connections:
+            if of_type is not None and other_types(of_type.expected, [by_id[key].msgtype]):
+                continue  # the violated type is the cause
             _, mistakes = connection_monitor(contract, by_id[key], topic)
             findings.update(dict.fromkeys(mistakes))
     return list(findings)

@@ -23,6 +23,8 @@ from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.contract import ContractResult, Outcome
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import counted
+from mosaico_ingest.rosbag.blocks import Connection
+from mosaico_ingest.services.draft_fields import FieldKind, FieldMeter, MeasuredField
 
 DEFAULT_TOLERANCE = 20.0
 """Percentage by which the range of the recordings' values is widened."""
@@ -34,6 +36,10 @@ _REGULAR_GAP = 10
 _MAX_FRAMES = 4
 _NO_FRAME = "\x00"
 """A frame id that no message has, so that the probe collects all of them."""
+_UNIT_NORM = (0.99, 1.01)
+"""The limits of the norm of quaternions that are rotations."""
+_MAX_LIMIT = 1e15
+"""Larger numbers are not limited."""
 _DIGITS = 3
 _COMMENT_COLUMN = 60
 _UNITS = ((60_000_000_000, "min"), (1_000_000_000, "s"), (1_000_000, "ms"), (1_000, "us"), (1, "ns"))
@@ -70,6 +76,8 @@ class MeasuredTopic(Struct, frozen=True):
     """The properties that the header stamps have: `monotonic`, `unique`."""
     fulfilled: frozenset[str]
     """The keys of further expectations that the topic fulfills."""
+    fields: Mapping[str, MeasuredField] = {}
+    """The values of message fields, by expression."""
 
     @property
     def is_regular(self) -> bool:
@@ -113,7 +121,13 @@ def measure_recording(path: AnyPath, *, ros_distro: Stores | str | None = None) 
             [connection.id for connection in connections], observe=None if order is None else order.add
         )
         observers = {one.id: monitor.observer(one.id) for one in connections}
-        decoders = {one.id: decoder_for(one) for one in connections if _has_header(one.definition)}
+        start_ns, end_ns = recording.start_ns or 0, recording.end_ns or 0
+        meters = _field_meters(connections, (start_ns + end_ns) // 2)
+        decoders = {
+            one.id: decoder_for(one)
+            for one in connections
+            if one.topic in meters or _has_header(one.definition)
+        }
         for block in blocks:
             observer, decoder = observers[block.connection], decoders.get(block.connection)
             if observer is not None:
@@ -121,12 +135,15 @@ def measure_recording(path: AnyPath, *, ros_distro: Stores | str | None = None) 
             if observer is not None and decoder is not None:
                 decoded = decoder.decode(block)
                 observer.messages(decoded.rows, decoded.index)
+                if observer.topic.name in meters:
+                    meters[observer.topic.name].add(decoded.rows, block.log_times[decoded.index])
         result = monitor.finish()
         types = {connection.topic: connection.msgtype for connection in connections}
-        start_ns, end_ns = recording.start_ns or 0, recording.end_ns or 0
         return MeasuredRecording(
             {
-                name: _measured_topic(topic, types[name], result)
+                name: _measured_topic(
+                    topic, types[name], result, meters[name].finish() if name in meters else {}
+                )
                 for name, topic in monitor.observed.items()
                 if topic.read
             },
@@ -159,6 +176,19 @@ def draft_contract(recordings: Sequence[MeasuredRecording], *, tolerance: float 
     return "\n".join(lines) + "\n"
 
 
+def _field_meters(connections: Sequence[Connection], middle_ns: int) -> dict[str, FieldMeter]:
+    """Return the meters of the topics with one message definition, by topic."""
+    meters: dict[str, FieldMeter] = {}
+    for topic in dict.fromkeys(connection.topic for connection in connections):
+        definitions = [connection.definition for connection in connections if connection.topic == topic]
+        first = definitions[0]
+        if first is not None and all(one is not None and one.text == first.text for one in definitions):
+            meter = FieldMeter(topic, first, middle_ns)
+            if meter:
+                meters[topic] = meter
+    return meters
+
+
 def _has_header(definition: object) -> bool:
     fields = getattr(getattr(definition, "message", None), "fields", ())
     return any(field.name == "header" for field in fields)
@@ -168,7 +198,9 @@ def _holds(outcome: Outcome) -> bool:
     return outcome is Outcome.PASSED
 
 
-def _measured_topic(topic: TopicMonitor, msgtype: str, result: ContractResult) -> MeasuredTopic:
+def _measured_topic(
+    topic: TopicMonitor, msgtype: str, result: ContractResult, fields: Mapping[str, MeasuredField]
+) -> MeasuredTopic:
     times = topic.times
     rows = [monitor for monitor in topic.rows.values() if monitor.has_header]
     latencies = [monitor.latency for monitor in rows if monitor.latency is not None and monitor.latency.count]
@@ -188,6 +220,7 @@ def _measured_topic(topic: TopicMonitor, msgtype: str, result: ContractResult) -
         fulfilled=frozenset(
             one.key for one in result.results if one.topic == topic.name and _holds(one.outcome)
         ),
+        fields=fields,
     )
 
 
@@ -230,6 +263,10 @@ def _topic_lines(name: str, topics: Sequence[MeasuredTopic], share: float) -> It
         yield "      out_of_order: 0"
     if "sequence_numbers" in fulfilled:
         yield "      sequence_numbers: {missing: 0}"
+    lines = list(_field_lines(topics, share)) if min(counts) >= _FEW_MESSAGES else []
+    if lines:
+        yield "      fields:"
+        yield from lines
 
 
 def _header_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
@@ -246,6 +283,45 @@ def _header_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str
     frames = {frame for topic in topics for frame in topic.frames}
     if frames and all(frames) and len(frames) <= _MAX_FRAMES and all(topic.frames for topic in topics):
         yield f"      frame_id: {_flow(sorted(frames))}"
+
+
+def _field_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
+    """Yield a line for each expression that all recordings have, and whose values an expectation can describe."""
+    for text in topics[0].fields:
+        measured = [topic.fields[text] for topic in topics if text in topic.fields]
+        if len(measured) < len(topics):
+            continue
+        expected = [*_constants(measured), *_limits(measured, share)]
+        if all(one.nulls == 0 for one in measured):
+            expected.append("nulls: 0")
+        if expected:
+            limits = [limit for one in measured if one.limits is not None for limit in one.limits]
+            line = f"        {plain(text)}: {{{', '.join(expected)}}}"
+            yield _line(line, _span_text(limits, number)) if limits else line
+
+
+def _constants(measured: Sequence[MeasuredField]) -> Iterator[str]:
+    values = {one.constant for one in measured}
+    if len(values) == 1 and None not in values:
+        yield f"equals: {plain(values.pop())}"
+
+
+def _limits(measured: Sequence[MeasuredField], share: float) -> Iterator[str]:
+    """Yield the expectation of a number: its range if it is stable, or else that it is finite."""
+    limits = [limit for one in measured if one.limits is not None for limit in one.limits]
+    if len(limits) < 2 * len(measured) or not any(limits):
+        return  # a number is not finite, or the field is not used
+    kind = measured[0].kind
+    if kind is FieldKind.QUATERNION:
+        if _UNIT_NORM[0] <= min(limits) and max(limits) <= _UNIT_NORM[1]:
+            yield f"between: [{_UNIT_NORM[0]}, {_UNIT_NORM[1]}]"
+    elif not all(one.is_stable for one in measured) or max(map(abs, limits)) >= _MAX_LIMIT:
+        yield "finite: true"
+    else:
+        low, high = _range(limits, share)
+        upper = _rounded(high, up=True)
+        is_maximum = kind is FieldKind.VECTOR and low < high / 2
+        yield f"max: {upper}" if is_maximum else f"between: [{_rounded(low, up=False)}, {upper}]"
 
 
 def _range(values: Sequence[float], share: float) -> tuple[float, float]:

@@ -121,6 +121,16 @@ def test_messages_out_of_order_in_the_file_are_counted_and_sorted_for_gaps(tmp_p
     assert found["gap"].outcome.value == "passed"
 
 
+def test_wrong_type_is_reported_in_place_of_its_unknown_fields(tmp_path: Path) -> None:
+    path = record(tmp_path / "a.mcap", ticks(0, 1))
+    topic = {"type": "std_msgs/msg/Float64", "fields": {"value": {"max": 1}}}
+    found = results(path, {"/tick": topic})
+    assert {key: one.outcome.value for key, one in found.items()} == {
+        "type": "failed",
+        "fields.value.max": "skipped",
+    }
+
+
 def test_one_of_two_types_on_a_topic_violates_the_type(tmp_path: Path) -> None:
     messages = [*ticks(0, 2), ("/tick", STAMPED, START + SECOND, {"header": {"stamp": ZERO, "frame_id": ""}})]
     path = record(tmp_path / "a.mcap", messages)

@@ -3,15 +3,22 @@
 from __future__ import annotations
 
 import csv
+import math
 from collections.abc import Sequence
 from decimal import Decimal
+from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import pyarrow as pa
 import pytest
 import yaml
 from defective_recordings import DEFECTS, clean_drive, write_drive
 from hypothesis import given
 from hypothesis import strategies as st
+from made_recordings import define
+from msgspec.structs import replace
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
@@ -19,6 +26,7 @@ from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.services.draft_contract import (
     MeasuredRecording,
     MeasuredTopic,
@@ -26,6 +34,7 @@ from mosaico_ingest.services.draft_contract import (
     draft_contract,
     measure_recording,
 )
+from mosaico_ingest.services.draft_fields import FieldKind, FieldMeter, MeasuredField
 
 LONGEST = 20
 
@@ -76,6 +85,7 @@ def test_draft_of_generated_recordings_is_fulfilled_by_all_of_them(tmp_path: Pat
         "latency burst",
         "wrong type",
         "missing chunk CRC",
+        "NaN burst",
     ],
 )
 def test_draft_of_clean_recording_is_violated_by_defect(tmp_path: Path, name: str) -> None:
@@ -124,6 +134,95 @@ def test_draft_of_irregular_topic_limits_messages_instead_of_rate() -> None:
     topic = draft["expect"]["topics"]["/a"]
     assert topic["messages"] == {"min": 40}
     assert not {"rate", "gap"} & topic.keys()
+
+
+def fields_of(*measured_fields: dict[str, MeasuredField], tolerance: float = 50) -> Any:
+    recordings = [measured(10, 10**8) for _ in measured_fields]
+    drafted = [
+        replace(one, topics={"/a": replace(one.topics["/a"], fields=of_recording)})
+        for one, of_recording in zip(recordings, measured_fields, strict=True)
+    ]
+    topics = yaml.safe_load(draft_contract(drafted, tolerance=tolerance))["expect"]["topics"]
+    return topics["/a"].get("fields")
+
+
+def test_draft_limits_stable_numbers_and_expects_finite_others() -> None:
+    stable = MeasuredField(limits=(20.0, 21.0), is_stable=True)
+    assert fields_of({"a": stable}, {"a": replace(stable, limits=(19.0, 20.0))}) == {
+        "a": {"between": [9.5, 31.5]}
+    }
+    assert fields_of({"a": stable}, {"a": replace(stable, is_stable=False)}) == {"a": {"finite": True}}
+    assert fields_of({"a": stable}, {"a": replace(stable, limits=None)}) is None
+    assert fields_of({"a": stable}, {}) is None
+    assert fields_of({"a": replace(stable, limits=(0.0, 0.0))}) is None
+
+
+def test_draft_limits_norms_of_vectors_and_unit_quaternions() -> None:
+    vector = MeasuredField(FieldKind.VECTOR, (0.1, 2.0), is_stable=True)
+    rotation = MeasuredField(FieldKind.QUATERNION, (0.999, 1.0), is_stable=False)
+    unset = replace(rotation, limits=(0.0, 1.0))
+    assert fields_of({"norm(v)": vector, "norm(q)": rotation, "norm(p)": unset}) == {
+        "norm(v)": {"max": 3},
+        "norm(q)": {"between": [0.99, 1.01]},
+    }
+
+
+def test_draft_expects_constants_that_all_recordings_share() -> None:
+    text, number = MeasuredField(constant="rgb8"), MeasuredField(constant=640, nulls=0)
+    assert fields_of({"a": text, "b": number, "c": text}, {"a": text, "b": number, "c": number}) == {
+        "a": {"equals": "rgb8"},
+        "b": {"equals": 640, "nulls": 0},
+    }
+
+
+@given(st.lists(st.floats(-9, 9) | st.sampled_from([math.nan, math.inf]), min_size=1, max_size=12), st.data())
+def test_meter_of_batches_equals_plain_computation(values: list[float], data: st.DataObject) -> None:
+    meter = FieldMeter("/a", define("p/msg/A", "float64 x\nint32 n\n"), middle_ns=6)
+    times = np.arange(len(values), dtype=np.int64)
+    column = np.array(values)
+    numbers = np.array(
+        data.draw(st.lists(st.integers(0, 1), min_size=len(values), max_size=len(values))), np.int32
+    )
+    cuts = sorted({0, *data.draw(st.lists(st.integers(0, len(values)), max_size=3)), len(values)})
+    for start, end in pairwise(cuts):
+        rows = pa.StructArray.from_arrays(
+            [pa.array(column[start:end]), pa.array(numbers[start:end])], ["x", "n"]
+        )
+        meter.add(rows, times[start:end])
+    measured_field = meter.finish()["x"]
+    is_finite = bool(np.isfinite(column).all())
+    assert measured_field.limits == ((column.min(), column.max()) if is_finite else None)
+    halves = [half for half in (column[:6], column[6:]) if len(half)]
+    is_stable = (
+        is_finite
+        and len(halves) == 2
+        and all(
+            abs(limit(halves[0]) - limit(halves[1])) <= 0.25 * (column.max() - column.min())
+            for limit in (np.min, np.max)
+        )
+    )
+    assert measured_field.is_stable == is_stable
+    assert meter.finish()["n"].constant == (1 if set(numbers.tolist()) == {1} else None)
+
+
+def test_meter_measures_norms_instead_of_their_members_and_no_times() -> None:
+    text = (
+        f"p/Vector position\np/Vector speed\np/Rotation q\np/Time t\nfloat32[3] list\nfloat32 volts\n{'=' * 80}\n"
+        f"MSG: p/Vector\nfloat64 x\nfloat64 y\n{'=' * 80}\nMSG: p/Rotation\nfloat64 x\nfloat64 y\nfloat64 z\n"
+        f"float64 w\n{'=' * 80}\nMSG: p/Time\nint32 sec\nuint32 nanosec\n"
+    )
+    definition = define("p/msg/A", text)
+    meter = FieldMeter("/a", definition, middle_ns=1)
+    vector, time = {"x": 3.0, "y": 4.0}, {"sec": 1, "nanosec": 1}
+    row = {"position": vector, "speed": vector, "q": {**vector, "z": 0.0, "w": 0.0}, "t": time}
+    rows = pa.array([{**row, "list": [1, 2, 3], "volts": 12.0}] * 2, ros_shape(definition))
+    meter.add(rows, np.arange(2))
+    assert {name: (one.kind, one.limits, one.is_stable) for name, one in meter.finish().items()} == {
+        "norm(position)": (FieldKind.VECTOR, (5, 5), False),
+        "norm(speed)": (FieldKind.VECTOR, (5, 5), True),
+        "norm(q)": (FieldKind.QUATERNION, (5, 5), True),
+        "volts": (FieldKind.FIELD, (12, 12), True),
+    }
 
 
 def test_draft_topic_of_some_recordings_is_not_required() -> None:
