@@ -22,6 +22,7 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
@@ -95,8 +96,10 @@ class RosbagInjector:
         return outcome.report
 
 
-def compile_job(manifest: Path, *, locked: bool = True) -> tuple[Job, ...]:
+def compile_job(manifest: Path, *, locked: bool = True) -> LazySequence[Job]:
     """Return the jobs of a manifest, one for each recording; `locked=False` does not read the lock file.
+
+    A job is built when it is accessed, so a manifest may select any number of recordings.
 
     Raises:
         ManifestError: The manifest has mistakes; `findings` has their locations.
@@ -107,7 +110,7 @@ def compile_job(manifest: Path, *, locked: bool = True) -> tuple[Job, ...]:
     from mosaico_ingest.pipeline.compile import compile_manifests
 
     jobs = compile_manifests(load_manifests(manifest), locked=locked)
-    for adapters, group in groupby(jobs, key=lambda job: job.adapters):
+    for adapters, group in groupby(jobs.samples, key=lambda job: job.adapters):
         if adapters.load or adapters.override:
             from mosaico_ingest.pipeline.adapter_check import check_adapters
 
@@ -308,11 +311,11 @@ def run(
     if isinstance(jobs, str | Path):
         manifests = (*manifests, used_manifest(Path(jobs)))
         jobs = compile_job(Path(jobs))
-    tasks = [task for job in jobs for task in _tasks(job)]
-    if any(task.job.expect is not None and task.job.expect.group is not None for task in tasks):
+    tasks = _tasks(jobs)
+    if any(task.job.expect is not None and task.job.expect.group is not None for task in tasks.samples):
         from mosaico_ingest.pipeline.contract_group import add_group_results
 
-        tasks = add_group_results(tasks)
+        tasks = LazySequence.of(add_group_results(tasks))
     from mosaico_ingest.pipeline.known import mark_known
 
     executor = executor or choose_executor(tasks)
@@ -323,14 +326,25 @@ def run(
     )
 
 
-def _tasks(job: Job | Task | ROSInjectionConfig) -> Iterator[Task]:
-    """Yield the task of a job, or one task for each part if a configuration splits its recording."""
+def _tasks(jobs: Sequence[Job | Task | ROSInjectionConfig]) -> LazySequence[Task]:
+    """Return the task of each job, or one task for each part if a configuration splits its recording."""
+    if isinstance(jobs, LazySequence):  # of a manifest, whose recordings are split already
+        return jobs.map(_task)
+    return LazySequence.of([part for job in jobs for part in _parts_of(job)])
+
+
+def _parts_of(job: Job | Task | ROSInjectionConfig) -> Iterator[Task]:
     if isinstance(job, Task):
         yield job
     elif isinstance(job, ROSInjectionConfig):
         yield from (Task(part, dry_run=job.dry_run) for part in _parts(job.job))
     else:
         yield from map(Task, _parts(job))
+
+
+def _task(job: Job | Task | ROSInjectionConfig) -> Task:
+    (task,) = _parts_of(job)
+    return task
 
 
 def _parts(job: Job) -> tuple[Job, ...]:

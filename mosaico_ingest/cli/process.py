@@ -12,6 +12,7 @@ from types import FrameType
 from typing import TYPE_CHECKING
 
 from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.lazy import LazySequence
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
@@ -58,7 +59,11 @@ def hide_pandas(jobs: Sequence[Job] = ()) -> None:
     pyarrow imports pandas with the first array, which takes longer than a short run. Programs can still import
     pandas afterwards; only pyarrow no longer recognizes its objects inside lists.
     """
-    if "pandas" in sys.modules or any(map(_uses_python_adapters, jobs)) or _has_installed_adapters():
+    if (
+        "pandas" in sys.modules
+        or any(map(_uses_python_adapters, LazySequence.of(jobs).samples))
+        or _has_installed_adapters()
+    ):
         return
     import numpy as np
     import pyarrow as pa

@@ -8,6 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
+from operator import methodcaller
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
@@ -34,6 +35,7 @@ from mosaico_ingest.cli.options import (
 from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
@@ -170,10 +172,10 @@ def run(
         raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
     if address is not None and executor is not ExecutorName.RAY:
         raise typer.BadParameter("needs --executor ray", param_hint="--address")
-    tasks = [Task(job) for manifest in manifests or () for job in api.compile_job(manifest)]
+    tasks = concatenate([api.compile_job(manifest).map(Task) for manifest in manifests or ()])
     used_manifests = [api.used_manifest(manifest) for manifest in manifests or ()]
     if plan is not None:
-        tasks += api.compile_plan(plan)
+        tasks = LazySequence.of(api.compile_plan(plan))
         sources = sorted({task.job.origin.file for task in tasks if task.job.origin.file})
         used_manifests = [api.used_manifest(Path(source)) for source in sources]
     if shard is not None:
@@ -188,7 +190,7 @@ def run(
     on_ray = None
     if executor is ExecutorName.RAY:
         on_ray = choose_executor(tasks, simultaneous=jobs, ray=True, address=address)
-    hide_pandas([task.job for task in tasks])
+    hide_pandas(tasks.map(_job_of))
     with send_telemetry(otel) as telemetry:
         run_tasks(
             tasks,
@@ -367,18 +369,19 @@ def run_tasks(
     level = log or ("ERROR" if quiet else tasks[0].job.run.log_level if tasks else "INFO")
     prepare = partial(set_up_logging, level, log_format)
     prepare()
+    batch = LazySequence.of(tasks)
     if log or quiet:
-        tasks = [task.with_log_level(level) for task in tasks]
+        batch = batch.map(methodcaller("with_log_level", level))
     interrupt_on_sigterm()
     collect_garbage_as_usual()
     report_files = {
-        path for path in (report, *(_report_path(task.job) for task in tasks)) if path is not None
+        path for path in (report, *(_report_path(task.job) for task in batch.samples)) if path is not None
     }
     for file in report_files - {STANDARD_OUTPUT}:
         check_output_file(file)
     failures: list[RunFinished] = []
 
-    with _display(tasks, as_json=as_json, quiet=quiet) as show:
+    with _display(batch, as_json=as_json, quiet=quiet) as show:
 
         def observe_all(position: int, event: Event) -> None:
             if isinstance(event, RunFinished) and event.error is not None:
@@ -386,8 +389,8 @@ def run_tasks(
             observe(position, event)
             show(position, event)
 
-        chosen = executor or choose_executor(tasks, simultaneous=jobs, prepare=prepare)
-        result = api.run(tasks, executor=chosen, observe=observe_all, manifests=manifests, verify=verify)
+        chosen = executor or choose_executor(batch, simultaneous=jobs, prepare=prepare)
+        result = api.run(batch, executor=chosen, observe=observe_all, manifests=manifests, verify=verify)
     write_errors = list(_write_results(result, report_files, on_finish))
     if not quiet and not as_json:
         from mosaico_ingest.cli.report import print_report
@@ -405,13 +408,15 @@ def run_tasks(
         raise typer.Exit(code)
 
 
-def _display(tasks: Sequence[Task], *, as_json: bool, quiet: bool) -> AbstractContextManager[BatchObserver]:
+def _display(
+    tasks: LazySequence[Task], *, as_json: bool, quiet: bool
+) -> AbstractContextManager[BatchObserver]:
     """Return the progress display. It is imported only if it is used, because rich is slow to import."""
     if quiet and not as_json:
         return nullcontext(ignore_batch)
     from mosaico_ingest.cli.progress import JsonLines, Tally, live_display, recording_sizes
 
-    tally = Tally(recording_sizes([task.job for task in tasks]) if len(tasks) > 1 else [1] * len(tasks))
+    tally = Tally(recording_sizes(tasks.map(_job_of)) if len(tasks) > 1 else [1] * len(tasks))
     return nullcontext(JsonLines(tally)) if as_json else live_display(tally)
 
 
@@ -427,11 +432,15 @@ def _write_results(
             yield error
 
 
+def _job_of(task: Task) -> Job:
+    return task.job
+
+
 def _report_path(job: Job) -> Path | None:
     return None if job.run.report is None else Path(job.run.report)
 
 
-def take_shard(items: Sequence[T], shard: str) -> list[T]:
+def take_shard(items: LazySequence[T], shard: str) -> LazySequence[T]:
     """Return every N-th item, starting with the I-th, for a shard `I/N` with I from 1 to N.
 
     Raises:
@@ -442,7 +451,7 @@ def take_shard(items: Sequence[T], shard: str) -> list[T]:
         raise ManifestError(
             f"--shard is {shard!r}", hint="write the number of the shard and of all shards, from 1/8 to 8/8"
         )
-    return list(items[int(first) - 1 :: int(count)])
+    return items[int(first) - 1 :: int(count)]
 
 
 @contextmanager

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
@@ -25,15 +26,21 @@ from mosaico_ingest.job.manifest import LoadedManifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
 from mosaico_ingest.job.values import LOCK_SUFFIX, LockFile
 from mosaico_ingest.job.yaml_source import Source
+from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.metadata.schema import read_json
 from mosaico_ingest.metadata.sources import source_spans, with_spans
+from mosaico_ingest.protocol.names import is_sequence_name
 from mosaico_ingest.remote import AnyPath, RemotePath, with_network, without_options
 from mosaico_ingest.rosbag.discovery import recording_files
-from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits
+from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits, has_split_number
 from mosaico_ingest.textfile import read_limited
 
 _READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")
+
+
+_Match = str | RemotePath
+"""A path that `bag.path` matches; local paths as text, which needs a quarter of the memory of a `Path`."""
 
 
 class Recording(Struct, frozen=True):
@@ -51,50 +58,76 @@ class Recording(Struct, frozen=True):
         return first.parent if first.name == "metadata.yaml" else first
 
 
-def find_recordings(loaded: LoadedManifest) -> tuple[Recording, ...]:
+def find_recordings(loaded: LoadedManifest) -> LazySequence[Recording]:
     """Return what `bag.path` names: a list is one recording, a glob one for each match.
 
     Raises:
         NothingMatched: A file is not there, or a glob matches no recording.
     """
     path = loaded.manifest.bag.path
+    sources: Sequence[_Match | SplitGroup]
     if isinstance(path, str):
-        return tuple(
-            Recording(group.files, index, group.stem)
-            for index, group in enumerate(_grouped(loaded, _matches(loaded, path, ("bag", "path"))), 1)
-        )
-    parts = [part for i, item in enumerate(path) for part in _matches(loaded, item, ("bag", "path", i))]
-    return (Recording(tuple(dict.fromkeys(parts)), 1),)
+        sources = _grouped(loaded, _matches(loaded, path, ("bag", "path")))
+    else:
+        parts = [part for i, item in enumerate(path) for part in _matches(loaded, item, ("bag", "path", i))]
+        sources = (SplitGroup(tuple(map(_path, dict.fromkeys(parts)))),)
+
+    def recording(position: int) -> Recording:
+        source = sources[position]
+        group = source if isinstance(source, SplitGroup) else SplitGroup((_path(source),))
+        return Recording(group.files, position + 1, group.stem)
+
+    return LazySequence(recording, range(len(sources)), [recording(0)])
 
 
-def _grouped(loaded: LoadedManifest, matches: list[AnyPath]) -> tuple[SplitGroup, ...]:
+def _grouped(loaded: LoadedManifest, matches: Sequence[_Match]) -> Sequence[_Match | SplitGroup]:
     """Return the recordings that the matches of `bag.path` belong to, according to `bag.group`."""
     group = loaded.manifest.bag.group
     if isinstance(group, FileNamePattern):
-        files = [file for match in matches for file in recording_files(match)]
+        files = [file for match in matches for file in recording_files(_path(match))]
         return group_splits(files, group.match)
     if group == "none" or len(matches) == 1:
-        return tuple(SplitGroup((match,)) for match in matches)
-    return group_splits(matches)
+        return matches
+    numbered = [match for match in matches if has_split_number(_file_name(match))]
+    group_of = {
+        file: group
+        for group in group_splits(list(map(_path, numbered)))
+        if group.stem is not None
+        for file in group.files
+    }
+    if not group_of:
+        return matches
+    return list(dict.fromkeys(group_of.get(_path(match), match) for match in matches))
 
 
-def sequence_name(loaded: LoadedManifest, recording: Recording) -> str:
-    """Return `sequence.name` with its placeholders filled in; `_` replaces characters that names cannot have.
+def _naming(loaded: LoadedManifest) -> Callable[[Recording], str]:
+    """Return the function that fills in `sequence.name`; `_` replaces characters that names cannot have.
 
     Raises:
         ManifestError: There is no such placeholder.
     """
     template = loaded.manifest.sequence.name
-    for placeholder in reversed(list(placeholders_in(template))):
+    placeholders = list(placeholders_in(template))
+    texts: list[str] = []
+    end = 0
+    for placeholder in placeholders:
         if not placeholder.known:
             raise ManifestError(
                 f"unknown placeholder {template[placeholder.start : placeholder.end]} in sequence.name",
                 where=loaded.where("sequence", "name"),
                 hint=f"the placeholders are {', '.join(f'{{{name}}}' for name in PLACEHOLDERS)}, and {{index:03}}",
             )
-        filled = _fill(placeholder, recording)
-        template = template[: placeholder.start] + filled + template[placeholder.end :]
-    return template
+        texts.append(template[end : placeholder.start])
+        end = placeholder.end
+
+    def name(recording: Recording) -> str:
+        filled = (
+            text + _fill(placeholder, recording)
+            for text, placeholder in zip(texts, placeholders, strict=True)
+        )
+        return "".join(filled) + template[end:]
+
+    return name
 
 
 def _fill(placeholder: Placeholder, recording: Recording) -> str:
@@ -115,25 +148,41 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
     return _REFUSED.sub("_", text).strip("_")
 
 
-def _matches(loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]) -> list[AnyPath]:
+def _matches(
+    loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]
+) -> Sequence[str] | Sequence[RemotePath]:
     """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
     path = with_network(loaded.resolve_or_url(pattern, *key_path), loaded.manifest.network.limits)
     if path.exists():
-        return [path]
+        return [path] if isinstance(path, RemotePath) else [str(path)]
     where = loaded.where(*key_path)
     if not has_magic(without_options(pattern)):
         raise NothingMatched(f"no such file or directory: {path}", where=where, hint=_nearby(path))
-    matches: list[AnyPath] = sorted(_glob(path), key=_order)
-    recordings = [match for match in matches if _is_recording(match)]
-    if not recordings:
-        only = f"; it matches {len(matches)} other files" if matches else ""
+    others = 0
+    texts: list[str] = []
+    remote: list[RemotePath] = []
+    for match in _glob(path):
+        if not _is_recording(match):
+            others += 1
+        elif isinstance(match, RemotePath):
+            remote.append(match)
+        else:
+            texts.append(str(match))
+    if not texts and not remote:
+        only = f"; it matches {others} other files" if others else ""
         raise NothingMatched(f"no recording matches {path}{only}", where=where, hint=_nearby(path))
-    return recordings
+    # The order of the components of the paths: a separator is smaller than every other character.
+    texts.sort(key=lambda text: text.replace(os.sep, "\0"))
+    remote.sort(key=lambda path: (path.root, path.key))
+    return texts or remote
 
 
-def _order(path: AnyPath) -> tuple[str, ...]:
-    """Return the sort key of a path; comparing paths themselves takes several times as long."""
-    return (path.root, path.key) if isinstance(path, RemotePath) else path.parts
+def _path(match: _Match) -> AnyPath:
+    return Path(match) if isinstance(match, str) else match
+
+
+def _file_name(match: _Match) -> str:
+    return match.rpartition(os.sep)[2] if isinstance(match, str) else match.name
 
 
 def _glob(path: AnyPath) -> Iterator[AnyPath]:
@@ -152,11 +201,12 @@ def _glob(path: AnyPath) -> Iterator[AnyPath]:
         pattern = "/".join(parts)
         depth = len(fixed.parts)
         matches = ((match, "/".join(match.parts[depth:])) for match in fixed.glob(pattern))
-    yield from (match for match, below in matches if _is_hidden(pattern) or not _is_hidden(below))
+    names_hidden = _is_hidden(pattern)
+    yield from (match for match, below in matches if names_hidden or not _is_hidden(below))
 
 
 def _is_hidden(path: str) -> bool:
-    return any(part.startswith(".") for part in path.split("/"))
+    return path.startswith(".") or "/." in path
 
 
 def _is_recording(path: AnyPath) -> bool:
@@ -191,17 +241,21 @@ def _nearby(path: AnyPath) -> str:
     return f"{folder} has {', '.join(recordings[:5]) or 'no recording'}"
 
 
-def compile_manifests(jobs: Sequence[LoadedManifest], *, locked: bool = True) -> tuple[Job, ...]:
+def compile_manifests(manifests: Sequence[LoadedManifest], *, locked: bool = True) -> LazySequence[Job]:
     """Return the jobs of the recordings of every combination of a manifest's matrix; see `compile_manifest`."""
-    compiled = tuple(job for loaded in jobs for job in compile_manifest(loaded, locked=locked))
-    _refuse_duplicates(jobs[0], [job.sequence.name for job in compiled])
-    return compiled
+    compiled = [compile_manifest(loaded, locked=locked) for loaded in manifests]
+    if len(compiled) == 1:
+        return compiled[0]
+    jobs = concatenate(compiled)
+    _refuse_duplicates(manifests[0], [job.sequence.name for job in jobs])
+    return jobs
 
 
-def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Job, ...]:
+def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> LazySequence[Job]:
     """Return a job for each recording that `bag.path` names, in the order of their paths.
 
-    With `locked=False`, the lock file of `definitions: locked` is not read.
+    All names are checked here, but a job is only built when it is accessed. With `split`, every recording is opened and
+    the jobs of all parts are kept. With `locked=False`, the lock file of `definitions: locked` is not read.
 
     Raises:
         NothingMatched: A file does not exist, or a glob matches no recording.
@@ -210,7 +264,7 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
     """
     _check_patterns(loaded)
     recordings = find_recordings(loaded)
-    names = [sequence_name(loaded, recording) for recording in recordings]
+    names = list(map(_naming(loaded), recordings))
     _refuse_duplicates(loaded, names)
     shared = _resolve_paths(loaded)
     metadata, origin = _metadata(loaded, shared.sequence)
@@ -219,29 +273,23 @@ def compile_manifest(loaded: LoadedManifest, *, locked: bool = True) -> tuple[Jo
     )
     sections: dict[str, Any] = {key: getattr(shared, key) for key in JobSettings.model_fields}
     lock = None if shared.definitions is None or not locked else read_lock_file(loaded.path, loaded.origin)
-    keys = {
-        *sections,
-        "lock",
-        "paths",
-        "origin",
-    }  # one set for all jobs, since it takes half of a job's memory
-    jobs = tuple(
-        Job.model_construct(
-            keys,
-            **{**sections, "sequence": sequence.replace(name=name), "lock": lock},
-            paths=recording.paths,
-            origin=origin,
-        ).check_name()
-        for recording, name in zip(recordings, names, strict=True)
-    )
-    jobs[0].check()  # the jobs differ only in their names
+    template = Job.model_construct(None, **{**sections, "lock": lock}, paths=(), origin=origin)
+
+    def job(position: int) -> Job:
+        name, paths = names[position], recordings[position].paths
+        return template.replace(sequence=sequence.replace(name=name), paths=paths)
+
+    for position, name in enumerate(names):
+        if not is_sequence_name(name):
+            job(position).check_name()
+    jobs = LazySequence(job, range(len(names)), [job(0).check()])  # the jobs differ only in their names
     if loaded.manifest.split is None:
         return jobs
     from mosaico_ingest.pipeline.split import split_job  # noqa: PLC0415 - only jobs with `split` need it
 
-    parts = tuple(part for job in jobs for part in split_job(job))
+    parts = [part for job in jobs for part in split_job(job)]
     _refuse_duplicates(loaded, [part.sequence.name for part in parts])
-    return parts
+    return LazySequence(parts.__getitem__, range(len(parts)), parts[:1])
 
 
 def _check_patterns(loaded: LoadedManifest) -> None:
@@ -255,13 +303,14 @@ def _check_patterns(loaded: LoadedManifest) -> None:
 
 
 def _refuse_duplicates(loaded: LoadedManifest, names: list[str]) -> None:
+    if len(set(names)) == len(names):
+        return
     name, count = Counter(names).most_common(1)[0]
-    if count > 1:
-        raise ManifestError(
-            f"{count} recordings would be named {name!r}",
-            where=loaded.where("sequence", "name"),
-            hint="add {stem}, {parent}, {index} or a variable of the matrix to sequence.name",
-        )
+    raise ManifestError(
+        f"{count} recordings would be named {name!r}",
+        where=loaded.where("sequence", "name"),
+        hint="add {stem}, {parent}, {index} or a variable of the matrix to sequence.name",
+    )
 
 
 def _resolve_paths(loaded: LoadedManifest) -> Manifest:

@@ -30,6 +30,11 @@ def check_sequence_name(name: str) -> str:
     return name
 
 
+def is_sequence_name(name: str) -> bool:
+    """Return whether `check_sequence_name` accepts a name."""
+    return 0 < len(name) <= _MAX_SEQUENCE_NAME and "/" not in name and _FORBIDDEN.search(name) is None
+
+
 def check_topic_name(name: str) -> str:
     """Return the name of a topic with its leading slash, or raise SinkError if it is not allowed."""
     _check_characters(name, _FORBIDDEN.search(name), kind="topic", allowed=_ALLOWED)

@@ -53,6 +53,11 @@ def group_splits(files: Sequence[AnyPath], number_of: NumberOf | None = None) ->
     return tuple(dict.fromkeys(group_of.get(file) or SplitGroup((file,)) for file in files))
 
 
+def has_split_number(name: str) -> bool:
+    """Return whether a file name ends with a number, as the names of splits do."""
+    return _NUMBERED.fullmatch(_without_suffix(name)[0]) is not None
+
+
 def numbering_gaps(
     files: Sequence[AnyPath], number_of: NumberOf | None = None, *, from_zero: bool = False
 ) -> Iterator[Finding]:
@@ -77,12 +82,10 @@ def numbering_gaps(
 
 
 def _split(file: AnyPath, number_of: NumberOf | None) -> _Split | None:
-    name = file.name.removesuffix(ACTIVE_SUFFIX)
-    suffix = RECORDING_NAME.search(name)
-    bare = name if suffix is None else name[: suffix.start()]
-    folder, kind = str(file.parent), "" if suffix is None else suffix[0].lower()
+    bare, suffix = _without_suffix(file.name)
+    folder, kind = str(file.parent), suffix.lower()
     if number_of is not None:
-        values = number_of(name) or number_of(bare)
+        values = number_of(file.name.removesuffix(ACTIVE_SUFFIX)) or number_of(bare)
         if values is None:
             return None
         others = tuple((key, value) for key, value in values.items() if key != "split")
@@ -93,6 +96,13 @@ def _split(file: AnyPath, number_of: NumberOf | None) -> _Split | None:
         return None
     key = (folder, kind, match["stem"], match["date"] is None)
     return _Split(file, match["stem"], key, int(match["split"]), match["date"] or "")
+
+
+def _without_suffix(name: str) -> tuple[str, str]:
+    """Return a file name without its suffix, and the suffix."""
+    name = name.removesuffix(ACTIVE_SUFFIX)
+    suffix = RECORDING_NAME.search(name)
+    return (name, "") if suffix is None else (name[: suffix.start()], suffix[0])
 
 
 def _groups(splits: Sequence[_Split], *, any_start: bool) -> Iterator[SplitGroup]:

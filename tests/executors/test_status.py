@@ -15,6 +15,7 @@ from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.cli.run import take_shard
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.report.timing import Step
 
@@ -85,7 +86,7 @@ def test_json_lines_and_metrics_report_the_run(job: Path) -> None:
 
 @given(st.lists(st.integers()), st.integers(1, 12))
 def test_shards_partition_the_recordings(items: list[int], count: int) -> None:
-    parts = [take_shard(items, f"{number}/{count}") for number in range(1, count + 1)]
+    parts = [take_shard(LazySequence.of(items), f"{number}/{count}") for number in range(1, count + 1)]
     assert sorted(item for part in parts for item in part) == sorted(items)
     assert max(map(len, parts)) - min(map(len, parts)) <= 1
 
@@ -93,4 +94,4 @@ def test_shards_partition_the_recordings(items: list[int], count: int) -> None:
 @pytest.mark.parametrize("text", ["0/2", "3/2", "1", "a/b", "1/0", ""])
 def test_shard_accepts_only_one_notation(text: str) -> None:
     with pytest.raises(ManifestError, match=r"1/8"):
-        take_shard([1], text)
+        take_shard(LazySequence.of([1]), text)

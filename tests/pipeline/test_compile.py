@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
@@ -32,7 +33,7 @@ from mosaico_ingest.pipeline.task import Task
 DEFAULT = ROSInjectionConfig("a", "b").job
 
 
-def compiled(folder: Path, text: str) -> tuple[Job, ...]:
+def compiled(folder: Path, text: str) -> Sequence[Job]:
     file = folder / "job.yaml"
     file.write_text(text)
     return compile_manifest(load_manifest(file, env={"KEY": "k"}))
