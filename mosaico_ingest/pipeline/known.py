@@ -46,9 +46,8 @@ def known_recordings(jobs: Sequence[Job]) -> list[bool]:
     """
     positions: dict[tuple[int, Path], list[int]] = defaultdict(list)
     for position, job in enumerate(jobs):
-        positions[id(job.target), job.folder].append(
-            position
-        )  # targets are not hashable, and jobs share them
+        # Targets are not hashable, and the jobs of a manifest share one.
+        positions[id(job.target), job.folder].append(position)
     known = [False] * len(jobs)
     for group in positions.values():
         stored = _stored([jobs[position] for position in group])

@@ -5,10 +5,9 @@ from __future__ import annotations
 import itertools
 import json
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -18,6 +17,7 @@ from hypothesis import strategies as st
 from made_recordings import define, record
 from mcap.writer import Writer as OfficialWriter
 from numpy.typing import NDArray
+from stamped_messages import MESSAGES, SECOND, STAMPED, START_NS, Messages, stamped, write_stamped
 
 from mosaico_ingest import api
 from mosaico_ingest.adapters.adapter import Envelope
@@ -37,22 +37,7 @@ from mosaico_ingest.rosbag.mcap.writer import McapWriter
 from mosaico_ingest.rosbag.serialization import Serializer
 from mosaico_ingest.rosbag.writers import open_writer
 
-START_NS = 1_700_000_000 * 10**9
-SECOND = 10**9
-STAMPED = define(
-    "test_msgs/msg/Stamped",
-    "std_msgs/Header header\nint32 value\n"
-    "================================================================================\n"
-    "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    "================================================================================\n"
-    "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
-)
 PLAIN = define("std_msgs/msg/Int32", "int32 data")
-
-
-def stamped(value: int, stamp_ns: int) -> dict[str, Any]:
-    stamp = {"sec": stamp_ns // SECOND, "nanosec": stamp_ns % SECOND}
-    return {"header": {"stamp": stamp, "frame_id": "base"}, "value": value}
 
 
 def run(path: Path, *, time: Mapping[str, object] | None = None, **keys: object) -> tuple[Outcome, Store]:
@@ -82,19 +67,8 @@ def rows(store: Store, topic: str, column: str) -> list[tuple[int, int]]:
     return list(zip(table["timestamp_ns"].to_pylist(), table[column].to_pylist(), strict=True))
 
 
-MESSAGES = st.lists(
-    st.tuples(
-        st.sampled_from(["/a", "/b"]),
-        st.integers(0, 6 * SECOND),
-        st.just(0) | st.integers(START_NS - SECOND, START_NS + 8 * SECOND),
-    ),
-    min_size=1,
-    max_size=24,
-)
-
-
 def expected_rows(
-    messages: Sequence[tuple[str, int, int]],
+    messages: Messages,
     topic: str,
     *,
     stamp: str,
@@ -155,7 +129,7 @@ def expected_rows(
 )
 def test_run_with_time_settings_equals_message_by_message_computation(
     *,
-    messages: list[tuple[str, int, int]],
+    messages: Messages,
     stamp: str,
     offset_ns: int,
     rate: float | None,
@@ -165,11 +139,7 @@ def test_run_with_time_settings_equals_message_by_message_computation(
     messages = [*messages, ("/c", 0, 0), ("/c", 5 * SECOND, 0)]  # so that every time range selects a message
     start_ns, end_ns = (None if second is None else START_NS + second * SECOND for second in window)
     with tempfile.TemporaryDirectory() as folder:
-        sent = [
-            (topic, STAMPED, START_NS + log, stamped(value, stamp_ns))
-            for value, (topic, log, stamp_ns) in enumerate(messages)
-        ]
-        path = record(Path(folder) / "drive.mcap", sorted(sent, key=lambda message: message[2]))
+        path = write_stamped(Path(folder) / "drive.mcap", messages)
         topic_settings: dict[str, object] = {
             "stamp": stamp,
             "time_offset": f"{offset_ns // 1_000_000:+} ms",
