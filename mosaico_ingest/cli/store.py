@@ -168,7 +168,7 @@ def show(
                 {
                     **_summary_json(SequenceSummary.of(info)),
                     "topics": [_topic_json(topic) for topic in info.topics],
-                    "attachments": [_attachment_json(each) for each in info.attachments],
+                    "attachments": [attachment_json(each) for each in info.attachments],
                 }
             )
         else:
@@ -272,15 +272,21 @@ def print_sequence(info: SequenceInfo) -> None:
             _duration_text(topic),
         )
     Terminal().print(table)
-    if info.attachments:
-        files = PlainTable("attachment", "media type", "size", "time", "file", numbers={"size"})
-        for each in info.attachments:
-            size, file = bytes_text(each.stored_bytes), str(each.path)
-            files.add_row(each.name, each.media_type, size, time_text(each.log_ns), file)
-        Terminal().print(files)
+    print_attachments(info.attachments)
     for note in info.notes:
         topic_name = f"{note.topic}: " if note.topic else ""
         print_line(f"{time_text(note.created_ns)} {topic_name}{note.message}", style="yellow")
+
+
+def print_attachments(attachments: Sequence[AttachmentInfo]) -> None:
+    """Print the attachments of a sequence with the paths of their files; without attachments, print nothing."""
+    if not attachments:
+        return
+    table = PlainTable("attachment", "media type", "size", "time", "file", numbers={"size"})
+    for each in attachments:
+        size, file = bytes_text(each.stored_bytes), str(each.path)
+        table.add_row(each.name, each.media_type, size, time_text(each.log_ns), file)
+    Terminal().print(table)
 
 
 def print_topic(info: TopicInfo, first_rows: Sequence[Mapping[str, Any]]) -> None:
@@ -360,7 +366,8 @@ def _summary_json(summary: SequenceSummary) -> dict[str, Any]:
     }
 
 
-def _attachment_json(info: AttachmentInfo) -> dict[str, Any]:
+def attachment_json(info: AttachmentInfo) -> dict[str, Any]:
+    """Return an attachment as JSON."""
     return {
         "name": info.name,
         "media_type": info.media_type,

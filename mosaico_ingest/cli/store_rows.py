@@ -131,9 +131,10 @@ def describe(
     ] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Print rate, jitter and gaps of each topic of a sequence, and the statistics of a topic's columns."""
+    """Print rate, jitter and gaps of each topic of a sequence and its attachments, or the statistics of a topic's columns."""
     from msgspec import to_builtins
 
+    from mosaico_ingest.cli.store import attachment_json, print_attachments
     from mosaico_ingest.view.statistics import describe_topic, topic_timing
     from mosaico_ingest.view.values import json_value
 
@@ -153,9 +154,11 @@ def describe(
             {"topic": topic.name, "ontology": topic.ontology.tag, **to_builtins(timing, enc_hook=_builtin)}
             for topic, timing in timings
         ]
-        print_json({"sequence": info.name, "topics": topics})
+        attachments = [attachment_json(each) for each in info.attachments]
+        print_json({"sequence": info.name, "topics": topics, "attachments": attachments})
     else:
         _print_timings(info, timings)
+        print_attachments(info.attachments)
 
 
 def open_topic(store: str, path: str) -> TopicInfo:

@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.job.values import PROVENANCE_KEY
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, PROVENANCE_KEY
 from mosaico_ingest.pages.design import render
 from mosaico_ingest.pages.pictures import Map, Strip, draw_map, picture_strip
 from mosaico_ingest.pages.plots import TopicPlots, topic_plots
@@ -184,11 +184,13 @@ def _topic_view(topic: TopicInfo, statistics: TopicStatistics | None, axis: Axis
 
 
 def _flatten(metadata: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield dotted keys and values as text, without the provenance."""
+    """Yield dotted keys and values as text, without the provenance and the attachments."""
     for key, value in metadata.items():
-        if isinstance(value, dict) and value and key != PROVENANCE_KEY:
+        if key in {PROVENANCE_KEY, ATTACHMENTS_KEY}:
+            continue
+        if isinstance(value, dict) and value:
             yield from _flatten(value, f"{prefix}{key}.")
-        elif key != PROVENANCE_KEY:
+        else:
             yield f"{prefix}{key}", str(value)
 
 

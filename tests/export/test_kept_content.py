@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping
+from html import escape
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,8 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.store import verify_attachments
 from mosaico_ingest.export import export_sequence
-from mosaico_ingest.job.values import IfExists
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
+from mosaico_ingest.pages.sequence import sequence_page
 from mosaico_ingest.pipeline.attachments import CUSTOM_DATA_KEY, RECORDS_KEY
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
@@ -143,6 +145,21 @@ def command(*arguments: str) -> object:
     with pytest.raises(SystemExit) as leave:
         main(list(arguments))
     return leave.value.code or 0
+
+
+def test_describe_and_page_list_attachments(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    _, store = ingest(write_mcap(tmp_path / "drive.mcap"))
+    files = [str(each.path) for each in store.sequence("drive").attachments]
+    assert command("store", "describe", "drive", "--store", str(tmp_path / "store"), "--json") == 0
+    described = json.loads(capsys.readouterr().out)["attachments"]
+    assert [(each["name"], each["file"]) for each in described] == list(
+        zip(["calib/cam 0.yaml", "empty.bin"], files, strict=True)
+    )
+    assert command("store", "describe", "drive", "--store", str(tmp_path / "store")) == 0
+    assert "calib/cam 0.yaml" in capsys.readouterr().out
+    page = sequence_page(store, "drive")
+    assert all(escape(file) in page for file in files)
+    assert ATTACHMENTS_KEY not in page
 
 
 def test_verify_reports_changed_and_missing_attachments(tmp_path: Path) -> None:
