@@ -101,10 +101,6 @@ class NothingMatched(IngestError):  # noqa: N818 - named after the condition, as
     exit_code = 3
 
 
-class EmptyPart(NothingMatched):
-    """A part of a recording has no rows, so its sequence is not written."""
-
-
 class BagError(IngestError):
     """The recording cannot be read."""
 

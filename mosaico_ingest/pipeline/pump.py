@@ -11,7 +11,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.errors import EmptyPart, IngestError, Interrupted, NothingMatched, VerificationError
+from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
@@ -37,11 +37,11 @@ from mosaico_ingest.report.timing import Step, Stopwatch
 from mosaico_ingest.rosbag.blocks import UnreadableRange
 from mosaico_ingest.rosbag.recording import Recording, damage_error
 
-_SHOWN_FIELDS = 8
-"""Number of undeclared fields that a finding names."""
-
 if TYPE_CHECKING:
     from mosaico_ingest.pipeline.contract import ContractRun
+
+_SHOWN_FIELDS = 8
+"""Number of undeclared fields that a finding names."""
 
 
 class Written(Struct, frozen=True):
@@ -94,7 +94,8 @@ def write_sequence(
                 missing = check_counts(plan, recording, topics, observe)
                 if contract is not None:
                     contract.conclude(request, session, observe)
-                _check_not_empty(plan, recording, topics)
+                if not any(topic.rows for topic in topics):
+                    _open_empty_topics(plan, recording, topics, session, observe)
                 observe(CommitStarted())
             except BaseException as error:
                 failure = _as_interrupt(error)
@@ -343,10 +344,18 @@ def _undeclared(topic: TopicPipeline) -> Finding:
     )
 
 
-def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeline, ...]) -> None:
-    """Raise if no topic has a row: an empty sequence would look like an ingested one."""
-    if any(topic.rows for topic in topics):
-        return
+def _open_empty_topics(
+    plan: Plan,
+    recording: Recording,
+    topics: tuple[TopicPipeline, ...],
+    session: Session,
+    observe: Observer,
+) -> None:
+    """Open the topics of a part without rows, which is stored so that `status` and later runs recognize it.
+
+    Raises:
+        IngestError: The recording is not split: an empty sequence would look like an ingested one.
+    """
     where = str(plan.files[0])
     read = sum(topic.read for topic in topics)
     if read == 0:
@@ -355,18 +364,17 @@ def _check_not_empty(plan: Plan, recording: Recording, topics: tuple[TopicPipeli
             raise damage
         in_window = plan.read_from_ns is not None or plan.read_until_ns is not None
         scope = "in the time range" if in_window else "on the selected topics"
-        raise _nothing_matched(plan, f"there is no message {scope}")
-    if read == sum(topic.dropped for topic in topics):
-        raise _nothing_matched(
-            plan, f"the settings of the topics and the time range drop all of {read} messages"
-        )
-    reason = next((topic.error for topic in topics if topic.error), "see the report for the reasons")
-    raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
-
-
-def _nothing_matched(plan: Plan, what: str) -> NothingMatched:
-    kind = NothingMatched if plan.part is None else EmptyPart
-    return kind(what, where=str(plan.files[0]), hint="nothing was written")
+        what = f"there is no message {scope}"
+    elif read == sum(topic.dropped for topic in topics):
+        what = f"the settings of the topics and the time range drop all of {read} messages"
+    else:
+        reason = next((topic.error for topic in topics if topic.error), "see the report for the reasons")
+        raise IngestError(f"all of {read} messages were rejected", where=where, hint=reason)
+    if plan.part is None:
+        raise NothingMatched(what, where=where, hint="nothing was written")
+    observe(Noted(Finding("empty-part", Severity.INFO, f"{plan.sequence.name} has no rows: {what}")))
+    for topic in plan.topics:
+        session.topic(topic.target, topic.ontology, topic.metadata)
 
 
 def _keeps_partial(plan: Plan, request: SequenceRequest, failure: BaseException, *, rows: int) -> bool:

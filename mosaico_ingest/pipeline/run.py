@@ -10,8 +10,8 @@ from msgspec import Struct
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.destinations.base import Sink
 from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.errors import ContractError, EmptyPart, IngestError, Interrupted
-from mosaico_ingest.findings import Finding, Severity
+from mosaico_ingest.errors import ContractError, IngestError, Interrupted
+from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.fingerprint import fingerprint, is_fingerprinted
@@ -65,10 +65,6 @@ def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
     is_written = False
     try:
         is_written = _ingest(task, events)
-    except EmptyPart as error:
-        events(
-            Noted(Finding("empty-part", Severity.INFO, f"{job.sequence.name} is not written: {error.what}"))
-        )
     except IngestError as error:
         return events.fail(error)
     except KeyboardInterrupt:
