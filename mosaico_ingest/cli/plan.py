@@ -24,7 +24,7 @@ from mosaico_ingest.cli.options import (
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Severity, join_names
 from mosaico_ingest.remote import is_url
-from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
+from mosaico_ingest.report.units import bytes_text, counted, seconds_text, time_text
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.expand import Expanded
@@ -137,7 +137,7 @@ def _print_recording(recording: RecordingPlan, folder: Path) -> None:
     for topic in sorted(plan["topics"], key=lambda topic: str(topic["topic"])):
         renamed = "" if topic["target"] == topic["topic"] else f" → {topic['target']}"
         every = "" if topic["every"] == 1 else f" / {topic['every']}"
-        count = "?" if topic["count"] is None else f"{count_text(topic['count'])}{every}"
+        count = f"{recording.count_texts[topic['target']]}{every}"
         table.add_row(
             f"{topic['topic']}{renamed}",
             topic["msgtype"],

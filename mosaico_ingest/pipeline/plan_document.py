@@ -49,6 +49,8 @@ class Sample(Part):
 
     target: str
     """The topic's name in the sequence."""
+    count: int | None = None
+    """The number of messages in the time range, according to the recording's index; null if it is unknown."""
     read: int
     rejected: int
     row_bytes: int | None
@@ -109,8 +111,20 @@ class RecordingPlan(Part):
 
     @property
     def is_empty(self) -> bool:
-        """Whether the index has no message of any selected topic."""
-        return all(topic["count"] == 0 for topic in self.plan["topics"])
+        """Whether the index has no message of any selected topic in the time range."""
+        has_latched = any(topic["latched"] for topic in self.plan["topics"])
+        return not has_latched and all(sample.count == 0 for sample in self.samples)
+
+    @property
+    def count_texts(self) -> dict[str, str]:
+        """The number of messages by the topic's name in the sequence, such as `2,110`, `600 of 2,110` or `?`."""
+        samples = {sample.target: sample.count for sample in self.samples}
+        has_range = (self.plan["read_from_ns"], self.plan["read_until_ns"]) != (None, None)
+        texts: dict[str, str] = {}
+        for topic in self.plan["topics"]:
+            count, total = (_count_text(n) for n in (samples[topic["target"]], topic["count"]))
+            texts[topic["target"]] = f"{count} of {total}" if has_range else total
+        return texts
 
 
 class PlanDocument(Part):
@@ -138,7 +152,7 @@ class PlanDocument(Part):
                     (
                         topic["topic"],
                         topic["msgtype"],
-                        "?" if topic["count"] is None else count_text(topic["count"]),
+                        recording.count_texts[topic["target"]],
                         topic["ontology"]["tag"],
                         topic["why"],
                     )
@@ -154,7 +168,8 @@ class PlanDocument(Part):
     @staticmethod
     def _headline(recording: RecordingPlan) -> str:
         plan = recording.plan
-        counts = [topic["count"] for topic in plan["topics"] if not topic["shares_messages"]]
+        shared = {topic["target"] for topic in plan["topics"] if topic["shares_messages"]}
+        counts = [sample.count for sample in recording.samples if sample.target not in shared]
         return plan_headline(plan["sequence"]["name"], counts, len(plan["excluded"]))
 
     @property
@@ -190,6 +205,10 @@ def read_plan(path: Path) -> PlanDocument:
 def plan_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a plan file."""
     return document_schema(PlanDocument)
+
+
+def _count_text(count: int | None) -> str:
+    return "?" if count is None else count_text(count)
 
 
 def notes(findings: Iterable[Finding]) -> tuple[Note, ...]:

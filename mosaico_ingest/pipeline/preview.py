@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os.path import relpath
 from pathlib import Path
@@ -133,7 +133,8 @@ def try_messages(
 ) -> tuple[Sample, ...]:
     """Decode and adapt the first messages of every topic of the plan, without writing; `monitor` observes them."""
     with MemorySink().open(plan.sequence.name, plan.sequence.metadata) as session:
-        trials = tuple(_trial(topic, recording, session) for topic in plan.topics)
+        counts = _counts(plan, recording)
+        trials = tuple(_trial(topic, recording, session, counts) for topic in plan.topics)
         link_outputs([trial.topic for trial in trials])
         by_connection = {
             connection: trial
@@ -170,6 +171,7 @@ class _Rejections:
 class _Trial(Struct, frozen=True):
     topic: TopicPipeline
     rejections: _Rejections
+    count: int | None
 
     def sample(self, stored: StoredTopic | None) -> Sample:
         rejections = tuple(
@@ -178,6 +180,7 @@ class _Trial(Struct, frozen=True):
         )
         return Sample(
             target=self.topic.plan.target,
+            count=self.count,
             read=self.topic.read,
             rejected=sum(rejection.count for rejection in rejections),
             row_bytes=-(-stored.stored_bytes // self.topic.written) if stored and stored.rows else None,
@@ -185,7 +188,23 @@ class _Trial(Struct, frozen=True):
         )
 
 
-def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
+def _counts(plan: Plan, recording: Recording) -> Mapping[int, int | None]:
+    """Return the number of messages of each connection in the time range; None if the index does not tell."""
+    if plan.read_from_ns is None and plan.read_until_ns is None:
+        return {connection.id: connection.count for connection in recording.connections}
+    connections = [connection for topic in plan.read_topics for connection in topic.connections]
+    is_indexed = not plan.selects_after_reading and not any(isinstance(p, RemotePath) for p in plan.files)
+    times = (
+        recording.index_times(connections, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
+        if is_indexed  # behind a URL, the index takes one request per chunk
+        else None
+    )
+    return {key: None if times is None else len(times[key]) for key in connections}
+
+
+def _trial(
+    topic: TopicPlan, recording: Recording, session: Session, counts: Mapping[int, int | None]
+) -> _Trial:
     """Open a topic whose rejected messages do not end the sample."""
     rejections = _Rejections()
     lenient = topic.replace(on_error=TopicLevelErrorPolicy.Ignore)
@@ -193,7 +212,8 @@ def _trial(topic: TopicPlan, recording: Recording, session: Session) -> _Trial:
     connections = {connection.id: connection for connection in recording.connections}
     for connection in topic.connections:
         pipeline.bind(connections[connection])
-    return _Trial(pipeline, rejections)
+    known = [count for key in topic.connections if (count := counts[key]) is not None]
+    return _Trial(pipeline, rejections, sum(known) if len(known) == len(topic.connections) else None)
 
 
 def _blocks(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:

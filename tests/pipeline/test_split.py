@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from made_recordings import define, record
+from stamped_messages import MESSAGES, SECOND, START_NS, Messages, write_stamped
 
 from mosaico_ingest import RosbagInjector, ROSInjectionConfig, api
 from mosaico_ingest.destinations.store import Store
@@ -27,37 +27,9 @@ from mosaico_ingest.report.model import RunReport
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.services.status import Status
 
-SECOND = 10**9
-START_NS = 1_700_000_000 * SECOND
-STAMPED = define(
-    "test_msgs/msg/Stamped",
-    "std_msgs/Header header\nint32 value\n"
-    "================================================================================\n"
-    "MSG: std_msgs/Header\nbuiltin_interfaces/Time stamp\nstring frame_id\n"
-    "================================================================================\n"
-    "MSG: builtin_interfaces/Time\nint32 sec\nuint32 nanosec\n",
-)
-
-Messages = Sequence[tuple[str, int, int]]
-"""Topic, log time after `START_NS` and header stamp of each message, both in ns; its value is its position."""
-
-
-def write(path: Path, messages: Messages) -> Path:
-    def stamp(ns: int) -> dict[str, Any]:
-        return {"stamp": {"sec": ns // SECOND, "nanosec": ns % SECOND}, "frame_id": "base"}
-
-    ordered = sorted(enumerate(messages), key=lambda item: item[1][1])
-    return record(
-        path,
-        (
-            (topic, STAMPED, START_NS + log, {"header": stamp(stamp_ns), "value": value})
-            for value, (topic, log, stamp_ns) in ordered
-        ),
-    )
-
 
 def every_second(path: Path, seconds: int = 10) -> Path:
-    return write(path, [("/a", second * SECOND, 0) for second in range(seconds)])
+    return write_stamped(path, [("/a", second * SECOND, 0) for second in range(seconds)])
 
 
 def write_job(path: Path, **keys: object) -> Path:
@@ -88,15 +60,6 @@ def names(store: Store) -> list[str]:
     return sorted(info.name for info in store.sequences())
 
 
-MESSAGES = st.lists(
-    st.tuples(
-        st.sampled_from(["/a", "/b"]),
-        st.integers(0, 6 * SECOND),
-        st.just(0) | st.integers(START_NS - SECOND, START_NS + 8 * SECOND),
-    ),
-    min_size=1,
-    max_size=20,
-)
 BOUND = st.none() | st.integers(0, 6 * SECOND)
 
 
@@ -190,26 +153,19 @@ def test_split_by_length_equals_message_by_message_computation(
     if end_ns is not None:
         time["end"] = instant(end_ns)
     with tempfile.TemporaryDirectory() as folder:
-        path = write(Path(folder, f"r{suffix}"), messages)
+        path = write_stamped(Path(folder, f"r{suffix}"), messages)
         report, store = run(
             path, bag={"time": time}, split={"by": f"{length_ns} ns"}, topic_settings={"/*": own}
         )
         for topic, latched in (("/a", False), ("/b", True)):
             rows = {name: oracle.rows(topic, start, end, latched=latched) for name, start, end in parts}
-            written = {
-                name for name, start, end in parts if any(rows_of(oracle, start, end))
-            }  # every may drop all messages of a part
-            expected = {name: values for name, values in rows.items() if values and name in written}
-            assert stored(store, topic) == expected
+            expected = {name: values for name, values in rows.items() if values}
+            assert {name: values for name, values in stored(store, topic).items() if values} == expected
+        assert names(store) == [name for name, _, _ in parts]
         if not parts:
             assert report.exit_code == 3
         else:
             assert report.exit_code == 0
-
-
-def rows_of(oracle: Oracle, start_ns: int, end_ns: int) -> Iterator[list[tuple[int, int]]]:
-    yield oracle.rows("/a", start_ns, end_ns, latched=False)
-    yield oracle.rows("/b", start_ns, end_ns, latched=True)
 
 
 def instant(ns: int) -> str:
@@ -232,23 +188,30 @@ def test_split_by_length_names_parts_and_stores_their_times(tmp_path: Path) -> N
 def test_split_latched_messages_start_every_part_and_are_marked(tmp_path: Path) -> None:
     messages = [("/map", 0, 0), *(("/a", second * SECOND, 0) for second in range(4))]
     _, store = run(
-        write(tmp_path / "r.mcap", messages), bag={"time": {"latched": ["/map"]}}, split={"by": "2 s"}
+        write_stamped(tmp_path / "r.mcap", messages), bag={"time": {"latched": ["/map"]}}, split={"by": "2 s"}
     )
     assert stored(store, "/map") == {"s_001": [(START_NS, 0)], "s_002": [(START_NS, 0)]}
     topic = next(entry for entry in store.sequence("s_002").topics if entry.name == "/map")
     assert topic.metadata[LATCHED_KEY] == {"before_ns": START_NS + 2 * SECOND}
 
 
-def test_split_conditions_apply_to_each_part_and_empty_parts_are_skipped(tmp_path: Path) -> None:
-    report, store = run(
-        every_second(tmp_path / "r.mcap"),
-        split={"by": "5 s"},
-        topic_settings={"/a": {"where": "value < 2", "on_change": ["value"]}},
-    )
-    assert names(store) == ["s_001"]
-    assert [one.status for one in report.recordings] == [RunStatus.COMPLETED, RunStatus.SKIPPED]
+def test_split_conditions_apply_to_each_part_and_empty_parts_are_stored_without_rows(tmp_path: Path) -> None:
+    path = every_second(tmp_path / "r.mcap")
+    keys: dict[str, Any] = {
+        "split": {"by": "5 s"},
+        "sequence": {"name": "s", "if_exists": "skip"},
+        "topic_settings": {"/a": {"where": "value < 2", "on_change": ["value"]}},
+    }
+    report, store = run(path, **keys)
+    assert {info.name: info.rows for info in store.sequences()} == {"s_001": 2, "s_002": 0}
+    assert [one.status for one in report.recordings] == [RunStatus.COMPLETED] * 2
     assert ["[empty-part]" in finding for finding in report.recordings[1].findings] == [True]
     assert report.exit_code == 0
+    for verify in (False, True):
+        statuses = api.job_status(tmp_path / "job.yaml", verify=verify)
+        assert [one.status for one in statuses] == [Status.DONE] * 2
+    report, _ = run(path, **keys)
+    assert [one.status for one in report.recordings] == [RunStatus.SKIPPED] * 2
 
 
 def test_split_repeated_run_skips_parts_and_completes_missing_parts(tmp_path: Path) -> None:
@@ -261,6 +224,25 @@ def test_split_repeated_run_skips_parts_and_completes_missing_parts(tmp_path: Pa
     report, store = run(path, **keys)
     assert [one.status for one in report.recordings] == [RunStatus.SKIPPED, RunStatus.COMPLETED]
     assert names(store) == ["s_001", "s_002"]
+
+
+def test_split_plan_counts_messages_of_each_part(tmp_path: Path) -> None:
+    messages = [("/a", 0, 0), ("/b", 1, 0), ("/a", 3 * SECOND, 0), ("/a", 5 * SECOND, 0)]
+    job = write_job(write_stamped(tmp_path / "r.mcap", messages), split={"by": "4 s"})
+    document = api.plan_job(job)
+    assert [recording.count_texts for recording in document.recordings] == [
+        {"/a": "2 of 3", "/b": "1 of 1"},
+        {"/a": "1 of 3", "/b": "0 of 1"},
+    ]
+    assert repr(document) == "<Plan s_001: 2 topics, 3 messages>\n<Plan s_002: 2 topics, 1 message>"
+
+
+def test_plan_of_time_range_without_index_of_times_counts_only_recording(tmp_path: Path) -> None:
+    path = write_stamped(tmp_path / "r.mcap", [("/a", 0, 0), ("/a", 5 * SECOND, 0)])
+    keys: dict[str, Any] = {"bag": {"time": {"start": "+2s"}}, "topic_settings": {"/a": {"stamp": "header"}}}
+    (recording,) = api.plan_job(write_job(path, **keys)).recordings
+    assert recording.count_texts == {"/a": "? of 2"}
+    assert not recording.is_empty
 
 
 def test_split_changed_length_is_another_job(tmp_path: Path) -> None:
@@ -305,7 +287,7 @@ def test_split_by_log_time_reads_each_message_about_once(
 
 def test_split_by_header_stamp_reads_log_times_of_the_part_only(tmp_path: Path) -> None:
     messages = [("/a", second * SECOND, START_NS + (second - 3) * SECOND) for second in range(10)]
-    path = write(tmp_path / "r.mcap", messages)
+    path = write_stamped(tmp_path / "r.mcap", messages)
     jobs = api.compile_job(write_job(path, split={"by": "5 s"}, topic_settings={"/*": {"stamp": "header"}}))
     assert [
         None if job.part is None else (job.part.start_ns, job.part.read_from_ns, job.part.read_until_ns)
