@@ -3,46 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, TypeAlias
+from typing import Any
 
 import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
-from mosaico_ingest.adapters.mapping.column_plan import (
-    ColumnPlan,
-    ExpressionSource,
-    MapLookup,
-    NestedAdapter,
-    StructSource,
-)
 from mosaico_ingest.adapters.mapping.columns import DataType, pt
-from mosaico_ingest.adapters.mapping.expressions import (
-    Cast,
-    CloseList,
-    Conditional,
-    Constant,
-    ElementAt,
-    EnvelopeField,
-    FieldAccess,
-    FunctionCall,
-    MakeList,
-    MessageRef,
-    OpenList,
-    OuterValue,
-    TypedExpression,
-)
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec
 from mosaico_ingest.adapters.mapping.model import Scalar, Value, ValueForm, records_of
+from mosaico_ingest.adapters.mapping.reads import column_reads, metadata_reads, unread_paths
 from mosaico_ingest.adapters.mapping.types import format_type, is_list
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
 from mosaico_ingest.adapters.standalone import mapping_of
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
-
-_FieldPath: TypeAlias = "tuple[str, ...]"
-_ScopePaths: TypeAlias = "tuple[_FieldPath, ...]"
-"""The paths of the messages around an expression, outermost first; names are looked up in the last one."""
 
 
 def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
@@ -52,102 +27,8 @@ def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
     """
     if not isinstance(adapter, MappingAdapter):
         return ()
-    read = set(_of_adapter(adapter, ()))
-    return tuple(".".join(path) for path in _outside(shape, (), read))
-
-
-def _outside(shape: DataType, at: _FieldPath, read: set[_FieldPath]) -> Iterator[_FieldPath]:
-    for field in shape:
-        path = (*at, field.name)
-        if any(path[:length] in read for length in range(len(path) + 1)):
-            continue
-        element = field.type
-        while is_list(element):
-            element = element.value_type
-        if pt.is_struct(element) and any(path_read[: len(path)] == path for path_read in read):
-            yield from _outside(element, path, read)
-        else:
-            yield path
-
-
-def _of_adapter(adapter: MappingAdapter, at: _FieldPath) -> Iterator[_FieldPath]:
-    for output in (adapter, *adapter.others):
-        yield from _of_field(output.record, (at,))
-        for typed in (*output.drops, *output.metadata.values()):
-            yield from _of_value(typed, (at,))
-
-
-def _of_field(field: ColumnPlan, at: _ScopePaths) -> Iterator[_FieldPath]:
-    """Yield the fields that a column reads, as paths from the message; `at` is the scope of its names."""
-    source = field.source
-    match source:
-        case ExpressionSource():
-            yield from _of_value(source.expression, at)
-        case MapLookup():
-            yield from _of_value(source.operand, at)
-            if source.otherwise is not None:
-                yield from _of_value(source.otherwise, at)
-        case NestedAdapter():
-            inner = source.adapter
-            path = _path_of(source.operand, at)
-            yield from _of_adapter(inner, path) if isinstance(inner, MappingAdapter) else (path,)
-        case StructSource():
-            inside = at if source.operand is None else (*at, _path_of(source.operand, at))
-            if source.operand is not None:
-                yield from _computed_inside(source.operand, at)
-            for column in source.fields:
-                yield from _of_field(column, inside)
-        case _:
-            pass
-    for column in field.overrides:
-        yield from _of_field(column, at)
-    if field.when is not None:
-        yield from _of_value(field.when, at)
-
-
-def _of_value(typed: TypedExpression, at: _ScopePaths) -> Iterator[_FieldPath]:
-    match typed:
-        case Constant() | EnvelopeField():
-            return
-        case OuterValue():
-            yield from _of_value(typed.operand, at[: -typed.levels])
-            return
-        case FunctionCall(arguments=parts) | MakeList(items=parts):
-            pass
-        case Conditional():
-            parts = (typed.condition, typed.then, typed.otherwise)
-        case Cast():
-            parts = (typed.operand,)
-        case _:
-            yield _path_of(typed, at)
-            yield from _computed_inside(typed, at)
-            return
-    for part in parts:
-        yield from _of_value(part, at)
-
-
-def _computed_inside(typed: TypedExpression, at: _ScopePaths) -> Iterator[_FieldPath]:
-    """Yield the fields below a computed list, as in `sort(a)[0]`."""
-    inner: Any = typed
-    while isinstance(inner, (FieldAccess, OpenList, CloseList, ElementAt)):
-        inner = inner.operand
-    if not isinstance(inner, MessageRef):
-        yield from _of_value(inner, at)
-
-
-def _path_of(typed: TypedExpression, at: _ScopePaths) -> _FieldPath:
-    """Return the path of the field that an expression reads; computed values have the path of no field."""
-    match typed:
-        case FieldAccess():
-            return (*_path_of(typed.operand, at), typed.name)
-        case OpenList() | CloseList() | ElementAt():
-            return _path_of(typed.operand, at)
-        case MessageRef():
-            return at[-1]
-        case OuterValue():
-            return _path_of(typed.operand, at[: -typed.levels])
-        case _:
-            return ("",)  # no field has an empty name
+    read = {*column_reads(adapter), *metadata_reads(adapter)}
+    return tuple(".".join(path) for path in unread_paths(shape, read))
 
 
 class ColumnOrigin(Struct, frozen=True):

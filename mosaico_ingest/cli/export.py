@@ -185,7 +185,7 @@ def _differences(topic: TopicExport) -> list[str]:
         lines.append(f"stored without a definition; {topic.assumed} is assumed")
     lines += [f"{column} cannot be inverted ({reason})" for column, reason in topic.not_invertible.items()]
     if topic.defaulted:
-        lines.append(f"not in the store, written as zero or empty: {', '.join(topic.defaulted)}")
+        lines.append(f"not in the store, so absent, zero or empty: {', '.join(topic.defaulted)}")
     lines += [
         f"{column} would differ in {count:,} messages after ingestion"
         for column, count in topic.changed.items()

@@ -59,7 +59,7 @@ class TopicExport(_Record):
     assumed: str = ""
     """The type and the distro of the definition, if the topic's metadata does not contain one."""
     defaulted: tuple[str, ...] = ()
-    """Message fields that the store does not contain; they are zero, empty or false in every message."""
+    """Message fields that the store does not contain; in every message, they are absent, or zero, empty or false."""
     not_invertible: dict[str, str] = {}
     """Columns whose expression cannot be inverted, with the expression."""
     changed: dict[str, int] = {}

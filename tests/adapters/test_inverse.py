@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import foxglove_schemas
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -226,7 +227,7 @@ fields:
   names: names
   axis: {fields: {x: axis.x, y: axis.y}}
 """
-EMPTY = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}, "speed": 1.5, "unused": {"x": 0.0}}
+EMPTY = {"header": {"stamp": {"sec": 0, "nanosec": 0}, "frame_id": ""}, "speed": 1.5}
 
 
 def test_invert_absent_fields_of_json_messages_stay_absent() -> None:
@@ -241,6 +242,104 @@ def test_invert_absent_fields_of_json_messages_stay_absent() -> None:
     assert not adapted.failures
     restored = invert(adapter, definition, {}).restore(adapted.rows, envelope)
     assert [json.loads(codec.from_dict(row)) for row in restored.rows.to_pylist()] == messages
+    assert restored.changed == {}
+
+
+REQUIRED_SCHEMA = {
+    "type": "object",
+    "properties": {
+        "id": {"type": "integer"},
+        "note": {"type": "string"},
+        "origin": {
+            "type": "object",
+            "properties": {"x": {"type": "number"}, "y": {"type": "number"}},
+            "required": ["x"],
+        },
+        "volts": {"type": "number"},
+        "limit": {"type": "number"},
+        "covariance": {"type": "array", "items": {"type": "number"}},
+        "joints": {
+            "type": "array",
+            "items": {
+                "type": "object",
+                "properties": {
+                    "name": {"type": "string"},
+                    "load": {"type": "number"},
+                    "rest": {"type": "number"},
+                },
+                "required": ["name"],
+            },
+        },
+    },
+    "required": ["id", "joints"],
+}
+REQUIRED_MAPPING = """
+version: 1
+adapter: RAdapter
+ros_type: acme.R
+ontology:
+  tag: R
+  fields:
+    y: float64
+    millivolts: float64
+    limit: float64
+    covariance: list[float64]
+    joints: list[string]
+    loads: list[float64]
+fields:
+  y: origin.y
+  millivolts: volts * 1000
+  limit: coalesce(limit, nan)
+  covariance: covariance(covariance)
+  joints: joints[].name
+  loads: coalesce(joints[].load, -1.0)
+"""
+
+
+def test_invert_fields_that_are_not_stored_are_absent_unless_they_are_required() -> None:
+    definition = json_schema.read_schema("acme.R", Embedded("jsonschema", json.dumps(REQUIRED_SCHEMA)))
+    codec, shape = JsonCodec(definition), ros_shape(definition)
+    joints: list[dict[str, Any]] = [{"name": "elbow", "load": 0.5}, {"name": "wrist"}]
+    full = {"volts": 1.5, "limit": 2.0, "covariance": [1.0, 0.0]}
+    messages: list[dict[str, Any]] = [
+        {"id": 0, "joints": []},
+        {"id": 0, "joints": joints, "origin": {"x": 0.0, "y": 1.0}, **full},
+    ]
+    lost = {"id": 7, "note": "n", "joints": [{"name": "elbow", "rest": 1.0}], "origin": {"x": 3.0, "y": 1.0}}
+    kept = {"id": 0, "joints": [{"name": "elbow"}], "origin": {"x": 0.0, "y": 1.0}}
+    payloads = [json.dumps(message).encode() for message in (*messages, lost)]
+    rows = pa.array([codec.to_dict(payload) for payload in payloads], shape)
+    adapter = load_adapter(REQUIRED_MAPPING).bind(definition, shape)
+    envelope = Envelope("/t", definition.root, np.zeros(3, np.int64))
+    adapted = adapter.adapt(rows, envelope)
+    assert not adapted.failures
+    restored = invert(adapter, definition, {}).restore(adapted.rows, envelope)
+    again = [codec.from_dict(row) for row in restored.rows.to_pylist()]
+    assert [json.loads(payload) for payload in again] == [*messages, kept]
+    assert [codec.to_dict(payload)["id"] for payload in again] == [0, 0, 0]
+    assert restored.changed == {}
+    assert set(restored.defaulted) == {"id", "note", "origin.x", "joints[].rest"}
+
+
+@pytest.mark.parametrize("name", ["LocationFix", "JointStates", "Odometry", "PoseInFrame"])
+def test_invert_fields_that_foxglove_messages_lack_stay_absent(name: str) -> None:
+    definition = protobuf_definition(name)
+    codec, shape = ProtobufCodec(definition), ros_shape(definition)
+    message = foxglove_schemas.MESSAGES[name]
+    stored = {key: value for key, value in message.items() if key not in {"heading", "color", "metadata"}}
+    if name == "JointStates":
+        stored["joints"] = [{"name": "elbow", "position": 0.5}, {"name": "wrist", "effort": 0.0}]
+    optional = {"velocity", "linear_velocity", "angular_velocity", "timestamp"} & stored.keys()
+    messages = [stored, *({key: stored[key] for key in stored.keys() - {one}} for one in optional)]
+    payloads = [foxglove_schemas.protobuf_payload(name, each) for each in messages]
+    rows: Any = pa.array([codec.to_dict(payload) for payload in payloads], shape)
+    adapter = BY_TYPE[f"foxglove.{name}"].bind(definition, shape)
+    envelope = Envelope("/t", definition.root, np.zeros(len(rows), np.int64))
+    adapted = adapter.adapt(rows, envelope)
+    assert not adapted.failures
+    restored = invert(adapter, definition, {}).restore(adapted.rows, envelope)
+    again = [codec.from_dict(row) for row in restored.rows.to_pylist()]
+    assert [codec.to_dict(payload) for payload in again] == rows.to_pylist()
     assert restored.changed == {}
 
 

@@ -79,7 +79,7 @@ def _from_ns(values: Array) -> Array:
     whole = np.asarray(filled_int(values))
     seconds, rest = np.divmod(whole, SECOND_NS)
     children = [arrays.array(seconds.astype(np.int32)), arrays.array(rest.astype(np.uint32))]
-    return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE))
+    return arrays.StructArray.from_arrays(children, fields=list(STAMP_TYPE), mask=pc.is_null(values))
 
 
 def filled_int(values: Array) -> Array:
@@ -90,7 +90,6 @@ def filled_int(values: Array) -> Array:
 ONE_ARGUMENT: Mapping[str, Callable[[Array], Array]] = {
     "covariance": _same,
     "variance": _same,
-    "empty_to_null": _same,
     "positive": _same,
     "coalesce": _same,
     "nan_to_null": _nan,
@@ -142,7 +141,7 @@ class _Scope(Struct, frozen=True):
     path: FieldPath = ()
     axes: tuple[Axis, ...] = ()
     keeps_null: bool = True
-    """Whether a null column means an absent field; a condition (`when`) also makes columns null."""
+    """Whether the field is absent where the value is null; otherwise, it has a value that gives null."""
 
 
 class ColumnInverter:
@@ -151,6 +150,7 @@ class ColumnInverter:
     def __init__(self, builder: MessageBuilder, metadata_texts: Mapping[FieldPath, str]) -> None:
         """`metadata_texts` are the fields of the first message that the topic metadata contains."""
         self._builder = builder
+        self._is_nullable = builder.presence is not None
         self._metadata_texts = metadata_texts
         self._clouds: list[CloudField] = []
         self._equalities: dict[tuple[FieldPath, int | None, Any], Mask] = {}
@@ -169,7 +169,7 @@ class ColumnInverter:
     def _column(self, field: ColumnPlan, values: Array, scope: _Scope) -> None:
         self._target = field.path
         absent = null_mask(values)
-        if field.when is not None:
+        if field.when is not None and not _is_presence(field.when):
             scope = replace(scope, keeps_null=False)
             if absent is not None:
                 self._make_false(field.when, absent, scope)
@@ -225,8 +225,7 @@ class ColumnInverter:
 
     def _expression(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
         values, axes = _opened(typed, values)
-        # An empty header is stored as null, too.
-        keeps_null = scope.keeps_null and _field_path(typed, scope) is not None and values.type != HEADER_TYPE
+        keeps_null = scope.keeps_null and values.type != HEADER_TYPE  # an empty header is stored as null, too
         self._assign(typed, values, _Scope(scope.path, (*scope.axes, *axes), keeps_null))
 
     def _assign(self, typed: TypedExpression, values: Array, scope: _Scope) -> None:
@@ -268,6 +267,12 @@ class ColumnInverter:
         first = typed.arguments[0]
         if typed.name in CLOUD_FUNCTIONS and not scope.axes and isinstance(typed.arguments[1], Constant):
             self._clouds.append(CloudField(str(typed.arguments[1].value), typed.name, values))
+        elif typed.name == "coalesce" and self._is_nullable and isinstance(typed.arguments[-1], Constant):
+            self._assign(first, _null_if(values, typed.arguments[-1].value), scope)
+        elif typed.name == "nan_to_null" and self._is_nullable:
+            self._assign(first, values, scope)
+        elif typed.name == "empty_to_null":
+            self._assign(first, values, replace(scope, keeps_null=False))
         elif typed.name in ONE_ARGUMENT:
             self._assign(first, ONE_ARGUMENT[typed.name](values), scope)
         elif typed.name == "compressed_format":
@@ -276,7 +281,7 @@ class ColumnInverter:
             )
         elif typed.name == "null_if" and isinstance(typed.arguments[1], Constant):
             value = arrays.scalar(typed.arguments[1].value).cast(values.type)
-            self._assign(first, pc.fill_null(values, value), scope)
+            self._assign(first, pc.fill_null(values, value), replace(scope, keeps_null=False))
         elif typed.name in {"min", "max", "clip"}:
             self._assign(self._argument_named_like_column(typed), values, scope)
         else:
@@ -364,6 +369,22 @@ class ColumnInverter:
 
     def _report_not_invertible(self, text: str) -> None:
         self.not_invertible.setdefault(self._target, text)
+
+
+def _is_presence(condition: TypedExpression) -> bool:
+    """Return whether a condition is that a field is present, as in `not is_null(velocity.x)`."""
+    match condition:
+        case FunctionCall(name="not", arguments=(FunctionCall(name="is_null", arguments=(FieldAccess(),)),)):
+            return True
+        case _:
+            return False
+
+
+def _null_if(values: Array, value: Any) -> Array:  # noqa: ANN401 - a literal
+    """Return the values with null in place of one value, which can be NaN."""
+    is_nan = isinstance(value, float) and math.isnan(value)
+    where = pc.is_nan(values) if is_nan else pc.equal(values, value)
+    return pc.if_else(where, arrays.scalar(None, values.type), values)
 
 
 def _field_path(typed: TypedExpression, scope: _Scope) -> FieldPath | None:

@@ -24,6 +24,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     struct_of,
     variable_list,
 )
+from mosaico_ingest.adapters.mapping.reads import ReadPath
 from mosaico_ingest.adapters.mapping.types import is_list
 
 CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
@@ -137,23 +138,32 @@ class _Constraint(Struct, frozen=True):
         return self.value[rows] if isinstance(self.value, np.ndarray) else self.value
 
 
+class Presence(Struct, frozen=True):
+    """Which fields of messages can be absent, as in protobuf and JSON."""
+
+    required: frozenset[ReadPath]
+    """The fields that every message has."""
+    absent: frozenset[ReadPath]
+    """The fields that are absent in all messages."""
+
+
 class MessageBuilder:
     """Builds a batch of messages from field values; the first non-null value of a field is kept.
 
-    With `nullable`, the fields of messages can be absent, as in protobuf and JSON: fields that are assigned with
-    `keeps_null` keep their nulls, and a nested message is absent where all its values are null.
+    With a `presence`, fields that are assigned with `keeps_null` keep their nulls unless they are required, and a nested
+    message is absent where all its values are null.
     """
 
-    def __init__(self, shape: DataType, rows: int, *, nullable: bool = False) -> None:
+    def __init__(self, shape: DataType, rows: int, presence: Presence | None = None) -> None:
         self._shape = shape
         self._rows = rows
-        self._nullable = nullable
+        self.presence = presence
         self._keep_null: set[FieldPath] = set()
         self._values: dict[FieldPath, Array] = {}
         self._axes: dict[FieldPath, Axis] = {}
         self._constraints: dict[FieldPath, list[_Constraint]] = defaultdict(list)
         self.defaulted: list[str] = []
-        """The fields that `build` filled with defaults, such as `header.seq`."""
+        """The fields without a value, such as `header.seq`, which `build` filled with defaults or left absent."""
 
     def assign(
         self, path: FieldPath, values: Array, axes: tuple[Axis, ...] = (), *, keeps_null: bool = False
@@ -164,6 +174,8 @@ class MessageBuilder:
             self._put_fields(path, type_, values, axes, keeps_null=keeps_null)
         elif is_list(type_) and pt.is_struct(type_.value_type):
             elements, axis = open_list(values)
+            if keeps_null and self._is_optional(path):
+                self._keep_null.add(path)
             self.assign((*path, EACH_ELEMENT), elements, (*axes, axis), keeps_null=keeps_null)
         else:
             lists = [at for at, name in enumerate(path) if name == EACH_ELEMENT]
@@ -171,7 +183,7 @@ class MessageBuilder:
                 self._axes.setdefault(path[:at], axis)
             current = self._values.get(path)
             self._values[path] = values if current is None else _coalesce(current, values)
-            if keeps_null and self._nullable:
+            if keeps_null and self._is_optional(path):
                 self._keep_null.add(path)
 
     def constrain(self, path: FieldPath, index: int | None, where: Mask, value: Any) -> None:  # noqa: ANN401 - a field's value
@@ -216,28 +228,42 @@ class MessageBuilder:
         below = [each for each in self._values if each[: len(path)] == path and each != path]
         if not path or path[-1] == EACH_ELEMENT or self._keep_null.isdisjoint(below):
             return None
-        if any(EACH_ELEMENT in each[len(path) :] for each in below):  # a list of messages is never absent
-            return None
-        masks = [null_mask(self._values[each]) for each in below]
+        masks = [self._null_below(path, each) for each in below]
         present = [mask for mask in masks if mask is not None]
         return np.logical_and.reduce(present) if len(present) == len(masks) else None
 
+    def _null_below(self, path: FieldPath, assigned: FieldPath) -> Mask | None:
+        """Return where an assigned field of a nested message, or the list that contains it, is null."""
+        if EACH_ELEMENT not in assigned[len(path) :]:
+            return null_mask(self._values[assigned])
+        return self._axes[assigned[: assigned.index(EACH_ELEMENT, len(path))]].null
+
     def _field(self, type_: DataType, path: FieldPath, rows: int) -> Array:
+        if self.presence is not None and _read_path(path) in self.presence.absent:
+            self._add_defaulted(path)
+            return arrays.nulls(rows, type_)
         if pt.is_struct(type_):
             return self._struct(type_, path, rows)
         if path in self._axes:
             axis = self._axes[path]
             elements = self._field(type_.value_type, (*path, EACH_ELEMENT), int(axis.offsets[-1]))
-            variable = variable_list(elements, axis.offsets, None, arrays.list_(type_.value_field))
+            absent = axis.null if path in self._keep_null else None
+            variable = variable_list(elements, axis.offsets, absent, arrays.list_(type_.value_field))
             return _of_size(variable, type_) if pt.is_fixed_size_list(type_) else variable
         values = self._values.get(path)
         if values is not None and path in self._keep_null and path not in self._constraints:
             return _with_nulls(values, type_)
         if values is None and path not in self._constraints:
-            self.defaulted.append(".".join(path).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
+            self._add_defaulted(path)
         array = zeros(type_, rows) if values is None else fill_nulls(values, type_)
         absent = np.ones(rows, bool) if values is None else null_mask(values)
         return array if absent is None else self._apply_constraints(array, path, absent)
+
+    def _is_optional(self, path: FieldPath) -> bool:
+        return self.presence is not None and _read_path(path) not in self.presence.required
+
+    def _add_defaulted(self, path: FieldPath) -> None:
+        self.defaulted.append(".".join(path).replace(f".{EACH_ELEMENT}", EACH_ELEMENT))
 
     def _apply_constraints(self, array: Array, path: FieldPath, absent: Mask) -> Array:
         for constraint in self._constraints.get(path, ()):
@@ -252,6 +278,10 @@ class MessageBuilder:
             changed = _with_values(elements, axis.offsets[:-1][rows] + constraint.index, constraint.of(rows))
             array = axis.close(changed, array.type)
         return array
+
+
+def _read_path(path: FieldPath) -> ReadPath:
+    return tuple(name for name in path if name != EACH_ELEMENT)
 
 
 def zeros(type_: DataType, rows: int) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.adapter import Adapter, Envelope, UnmodeledAdapter
 from mosaico_ingest.adapters.image import without_files
 from mosaico_ingest.adapters.inverse.columns import ColumnInverter
-from mosaico_ingest.adapters.inverse.message_builder import FieldPath, MessageBuilder
+from mosaico_ingest.adapters.inverse.message_builder import FieldPath, MessageBuilder, Presence
 from mosaico_ingest.adapters.mapping.columns import (
     Array,
     DataType,
@@ -30,11 +30,12 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.expressions import FieldAccess, MessageRef, TypedExpression
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
+from mosaico_ingest.adapters.mapping.reads import ReadPath, column_reads, unread_paths
 from mosaico_ingest.adapters.mapping.types import is_list
 from mosaico_ingest.adapters.python import PythonAdapter
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
-from mosaico_ingest.rosbag.definitions.model import Definition, Language
+from mosaico_ingest.rosbag.definitions.model import Definition, Language, MessageType
 from mosaico_ingest.rosbag.typestore import message_values, typestore_of
 
 
@@ -91,9 +92,9 @@ class Restored(Struct, frozen=True):
     """A batch of restored messages, and how they differ from the original ones."""
 
     rows: pa.StructArray
-    """The messages in the ROS shape, without nulls."""
+    """The messages in the ROS shape; null for absent fields, which ROS messages do not have."""
     defaulted: tuple[str, ...] = ()
-    """Fields that are not stored; they are zero, empty or false."""
+    """Fields that are not stored; they are absent, or zero, empty or false where messages cannot lack them."""
     not_invertible: Mapping[str, str] | None = None
     """Columns that cannot be inverted, with their expressions."""
     changed: Mapping[str, int] | None = None
@@ -122,7 +123,7 @@ def invert(adapter: Adapter, definition: Definition, metadata: Mapping[str, Any]
         if adapter.inverse_problem is not None:
             raise AdapterError(adapter.inverse_problem)
         texts = _metadata_texts(adapter.metadata, metadata)
-        return _MappingInverse(adapter, shape, texts, definition.language is not Language.ROS)
+        return _MappingInverse(adapter, shape, texts, _presence_of(adapter, definition))
     if isinstance(adapter, PythonAdapter) and adapter.is_invertible:
         if definition.language is not Language.ROS:
             raise AdapterError(f"to_ros of {adapter.adapter.__name__} applies to ROS messages only")
@@ -150,12 +151,12 @@ class _MappingInverse(Struct, frozen=True):
     adapter: MappingAdapter
     shape: pa.StructType
     metadata_texts: Mapping[FieldPath, str]
-    nullable: bool
+    presence: Presence | None
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
         if self.adapter.ontology.tag == _IMAGE:
             rows = without_files(rows)
-        builder = MessageBuilder(self.shape, len(rows), nullable=self.nullable)
+        builder = MessageBuilder(self.shape, len(rows), self.presence)
         undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)
         messages = builder.build()
@@ -205,6 +206,24 @@ def _changed(adapter: Adapter, rows: Array, messages: Array, envelope: Envelope)
     dropped = sum(len(positions) for positions in adapted.dropped.values())
     counts = {"(refused)": len(adapted.failures), "(dropped)": dropped}
     return changed | {name: count for name, count in counts.items() if count}
+
+
+def _presence_of(adapter: MappingAdapter, definition: Definition) -> Presence | None:
+    """Return which fields can be absent, and are if no column reads them; None for messages of ROS."""
+    if definition.language is Language.ROS:
+        return None
+    required = frozenset(_required_fields(definition, definition.message, ()))
+    unread = unread_paths(ros_shape(definition), set(column_reads(adapter)))
+    return Presence(required, frozenset(unread) - required)
+
+
+def _required_fields(definition: Definition, message: MessageType, at: ReadPath) -> Iterator[ReadPath]:
+    for field in message.fields:
+        path = (*at, field.name)
+        if field.is_required:
+            yield path
+        if field.is_message:
+            yield from _required_fields(definition, definition.types[field.type], path)
 
 
 def _metadata_texts(

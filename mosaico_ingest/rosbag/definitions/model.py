@@ -97,6 +97,8 @@ class Field(Struct, frozen=True):
     """The length of an array, or the bound of a sequence (0: unbounded)."""
     string_bound: int = 0
     """The bound N of `string<=N` (0: unbounded); it does not affect the bytes."""
+    is_required: bool = False
+    """Whether a protobuf or JSON message without the field is invalid."""
 
 
 class Constant(Struct, frozen=True):

@@ -175,14 +175,15 @@ def _add_types(struct: JsonType, name: str, types: dict[str, MessageType]) -> No
     for field, inner in struct.fields:
         container = Container.SCALAR if inner.item is None else Container.SEQUENCE
         item = inner.item or inner
+        is_required = field in struct.required
         if item.kind != "struct":
             kind = item.kind if item.item is None else "json"  # `Field` cannot express lists of lists
-            fields.append(Field(field, kind, container=container))
+            fields.append(Field(field, kind, container=container, is_required=is_required))
             continue
         nested = _free_name(item, f"{name}.{field}", types)
         if nested not in types:
             _add_types(item, nested, types)
-        fields.append(Field(field, nested, is_message=True, container=container))
+        fields.append(Field(field, nested, is_message=True, container=container, is_required=is_required))
     types[name] = MessageType(name, tuple(fields), struct.constants)
 
 

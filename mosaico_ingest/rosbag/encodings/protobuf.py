@@ -234,8 +234,9 @@ def _add_types(message: Descriptor, types: dict[str, MessageType]) -> None:
 def _field(field: FieldDescriptor) -> Field:
     container = Container.SEQUENCE if field.is_repeated else Container.SCALAR
     if form_of(field) is Form.MESSAGE:
-        return Field(field.name, message_type(field).full_name, is_message=True, container=container)
-    return Field(field.name, _type_of(field)[0], container=container)
+        name = message_type(field).full_name
+        return Field(field.name, name, is_message=True, container=container, is_required=field.is_required)
+    return Field(field.name, _type_of(field)[0], container=container, is_required=field.is_required)
 
 
 def _constants(message: Descriptor) -> Iterator[Constant]:
