@@ -123,6 +123,10 @@ def _describe_part(part: SequencePart | None) -> PartDocument | None:
     return {"recording": part.recording, "number": part.number, "event": part.event}
 
 
+def _describe_contract(contract: Contract | None) -> dict[str, JsonValue] | None:
+    return None if contract is None else contract.expect.model_dump(mode="json", exclude_defaults=True)
+
+
 def _describe_quarantine(
     quarantine: QuarantineSettings | None, info: SerializationInfo
 ) -> dict[str, JsonValue] | None:
@@ -239,6 +243,8 @@ class Plan(Part):
     """The attachments that become files of the sequence."""
     topics: tuple[TopicPlan, ...]
     excluded: tuple[ExcludedTopic, ...] = ()
+    contract: Annotated[Contract | None, Unchecked(), PlainSerializer(_describe_contract)] = None
+    """The data contract: the keys of `expect` that differ from their defaults."""
 
     kept_metadata: Annotated[Mapping[str, Any], Unchecked()] = Field(default={}, exclude=True)
     """Metadata of the recording that the sequence keeps under reserved keys."""
@@ -248,8 +254,6 @@ class Plan(Part):
     findings: Annotated[tuple[Finding, ...], Unchecked()] = Field(default=(), exclude=True)
     missing: Annotated[tuple[Path | RemotePath, ...], Unchecked()] = Field(default=(), exclude=True)
     """Splits that the recording's metadata lists and that do not exist."""
-    contract: Annotated[Contract | None, Unchecked()] = Field(default=None, exclude=True)
-    """The data contract. It is not part of the document, because it does not change the stored rows."""
     attempt: Annotated[Attempt | None, Unchecked()] = Field(default=None, exclude=True)
     """The attempt of an executor that may start a recording more than once."""
 

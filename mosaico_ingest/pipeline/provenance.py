@@ -335,9 +335,9 @@ def _source(path: AnyPath) -> Source:
 
 
 def _job_digest(plan: Plan) -> str:
-    """Return a digest of the decisions about the stored rows: not of paths, the destination or `if_exists`."""
+    """Return a digest of the decisions about the stored rows: not of paths, the destination, `if_exists` or `expect`."""
     document = plan.document(folder=Path())
-    for key in ("files", "destination"):
+    for key in ("files", "destination", "contract"):
         del document[key]
     for key in ("if_exists", "family"):
         del document["sequence"][key]

@@ -160,6 +160,23 @@ def test_plan_check_changed_manifest_exits_1_with_differences(ingest: Ingest) ->
     assert len(lines) == 5
 
 
+def test_plan_check_detects_changed_contract_and_run_refuses_its_plan(ingest: Ingest) -> None:
+    with Path(JOB).open("a") as file:
+        file.write("\nexpect: {required: [/imu], topics: {/imu: {rate: {min: 50 Hz}}}}\n")
+    assert ingest("run", JOB)[0] == 0
+    ingest("plan", JOB, "--out", "plan.json")
+    edit(JOB, "min: 50 Hz", "min: 60 Hz")
+    assert ingest("plan", JOB, "--check", "plan.json") == (
+        1,
+        "quickstart_drive: contract topics /imu rate min: 50 Hz → 60 Hz\n",
+    )
+    code, output = ingest("run", "--plan", "plan.json")
+    assert code == 1
+    assert "[plan-drift]" in output
+    edit(JOB, "required: [/imu], ", "")
+    assert '- contract required: ["/imu"]' in ingest("plan", JOB, "--check", "plan.json")[1]
+
+
 def test_plan_check_detects_changed_adapter_but_not_comments(ingest: Ingest) -> None:
     adapter = "configs/quickstart/adapters/battery_pack.yaml"
     ingest("plan", JOB, "--out", "plan.json")
