@@ -17,7 +17,7 @@ from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.pipeline import fingerprint, run
+from mosaico_ingest.pipeline import fingerprint, opening
 from mosaico_ingest.pipeline.known import known_recordings
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.services.status import Status
@@ -274,7 +274,7 @@ def test_run_of_known_recordings_opens_none(
     def open_none(*_arguments: object, **_options: object) -> None:
         raise AssertionError("a recording was opened")
 
-    monkeypatch.setattr(run, "open_recording", open_none)
+    monkeypatch.setattr(opening, "open_recording", open_none)
     report = api.run(job)
     assert [one.status for one in report.recordings] == [RunStatus.SKIPPED] * 3
     assert report.exit_code == 0
