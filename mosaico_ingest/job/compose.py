@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from itertools import count, product
 from os.path import normpath, relpath
@@ -80,7 +80,13 @@ def variables(mapping: Value) -> dict[str, str]:
 
 
 _REFERENCE = re.compile(r"\$(?:(\$)|\{([^{}]*)\}|(?=\{))")
-_INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::([-?])(.*))?", re.DOTALL)
+_INSIDE = re.compile(r"([A-Za-z_][A-Za-z0-9_]*)(?::(int|float|bool))?(?::([-?])(.*))?", re.DOTALL)
+_KINDS: Mapping[str, tuple[re.Pattern[str], Callable[[str], Scalar], str]] = {
+    "int": (re.compile(r"[+-]?[0-9]+"), int, "a whole number"),
+    "float": (re.compile(r"[+-]?[0-9]+(\.[0-9]+)?([eE][+-]?[0-9]+)?"), float, "a number"),
+    "bool": (re.compile(r"[Tt]rue|[Ff]alse"), lambda text: text.lower() == "true", "true or false"),
+}
+"""The notation, the conversion and the description of the values of each kind of variable."""
 
 
 @dataclass(slots=True)
@@ -148,8 +154,23 @@ def _value(value: Value, path: KeyPath, source: Source, known: _Variables, out: 
     if isinstance(value, list):
         return [_value(inner, (*path, index), source, known, out) for index, inner in enumerate(value)]
     if isinstance(value, str) and "$" in value:
-        return _text(value, path, source, known, out)
+        return _typed(_text(value, path, source, known, out), value, path, source, out)
     return value
+
+
+def _typed(text: str, written: str, path: KeyPath, source: Source, out: Filled) -> Value:
+    """Return the value of a text that is written as one variable with a kind, such as `${RUN:int}`, else the text."""
+    reference = _REFERENCE.fullmatch(written)
+    inside = _INSIDE.fullmatch(reference[2] or "") if reference is not None else None
+    if inside is None or inside[2] is None or text == written:
+        return text
+    notation, convert, description = _KINDS[inside[2]]
+    if notation.fullmatch(text):
+        return convert(text)
+    message = f"{inside[1]} must be {description}, not the text {text!r}"
+    hint = f"set {inside[1]} to {description}, or write ${{{inside[1]}}} for a text"
+    out.findings.append(Finding("wrong-type", Severity.ERROR, message, source.span(path), hint))
+    return text
 
 
 def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Filled) -> str:
@@ -168,7 +189,7 @@ def _text(text: str, path: KeyPath, source: Source, known: _Variables, out: Fill
                 match,
             )
             return match[0]
-        name, operator, rest = inside.groups()
+        name, _, operator, rest = inside.groups()
         value = known.get(name)
         if value is not None:
             return value.replace("$", "$$") if known.alone else value

@@ -196,10 +196,10 @@ class MetadataSources(Section):
     """
 
     records: tuple[Text, ...] = Field(default=(), examples=[["vehicle", "drive_*"]])
-    """Names or globs of metadata records of MCAP files (a `.db3` file has at most the record `rosbag2`); each entry of a record becomes a key, whose value is text."""
+    """Names or globs of metadata records of MCAP files (a `.db3` file has at most the record `rosbag2`); each entry of a record becomes a key. Its value is text, or what `metadata_schema` requires."""
     custom_data: bool = False
-    """Whether to add the `custom_data` of rosbag2, whose values are text: from `metadata.yaml`, or else from its copy in the
-    file."""
+    """Whether to add the `custom_data` of rosbag2: from `metadata.yaml`, or else from its copy in the file. Its values are
+    text, or what `metadata_schema` requires."""
     file_name: (
         Annotated[FileNamePattern, Parsed(FileNamePattern, r"\{[A-Za-z_][A-Za-z0-9_]*(:[^{}]+)?\}")] | None
     ) = Field(default=None, examples=["{vehicle}_{date:%Y%m%d}_{run:int}.mcap"])

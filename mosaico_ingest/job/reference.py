@@ -59,6 +59,7 @@ After reading this page, you know every key of a job manifest. Only `bag.path` i
 
 * Relative paths start at the manifest's folder.
 * `${VAR}`, `${VAR:-default}` and `${VAR:?message}` insert environment variables into texts, numbers and words; `$$` is a dollar sign.
+* In metadata, where any type is valid, `${VAR}` is a text. `${VAR:int}`, `${VAR:float}` and `${VAR:bool}` are numbers, `true` or `false`.
 * Unknown keys are errors. `ingest lint job.yaml` reports all problems of a manifest with their locations.
 """
 

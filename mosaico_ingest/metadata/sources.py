@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from fnmatch import fnmatchcase
+from pathlib import Path
 from typing import Any
 
 from msgspec import Struct, field
@@ -15,7 +16,8 @@ from mosaico_ingest.findings import Finding, Severity, Span, join_names, nearest
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.model import Job, Origin
 from mosaico_ingest.job.yaml_source import KeyPath, Source
-from mosaico_ingest.metadata.schema import read_json
+from mosaico_ingest.metadata.schema import load_schema, read_json
+from mosaico_ingest.metadata.validation import with_required_types
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.recording import Recording
 
@@ -149,13 +151,13 @@ def _record_additions(job: Job, patterns: Sequence[str], recording: Recording) -
             hint = f"did you mean {close!r}? {hint}" if close else hint
             yield _Addition("the metadata records", span, problem=problem, hint=hint)
         for name in names:
-            yield _Addition(f"the metadata record {name!r}", span, _with_valid_keys(records[name]))
+            yield _Addition(f"the metadata record {name!r}", span, _values(job, records[name]))
 
 
 def _custom_data(job: Job, recording: Recording) -> _Addition:
     span, data = _span(job, "custom_data"), recording.custom_data()
     if data:
-        return _Addition("custom_data", span, _with_valid_keys(data))
+        return _Addition("custom_data", span, _values(job, data))
     return _Addition(
         "custom_data",
         span,
@@ -164,9 +166,14 @@ def _custom_data(job: Job, recording: Recording) -> _Addition:
     )
 
 
-def _with_valid_keys(texts: Mapping[str, str]) -> dict[str, str]:
-    """Return the texts with `_` for characters that the platform rejects in keys, without empty keys."""
-    return {name: text for key, text in texts.items() if (name := _REFUSED.sub("_", key))}
+def _values(job: Job, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return the texts of a source with the types that the metadata schema requires.
+
+    `_` replaces characters that the platform rejects in keys, and empty keys are dropped.
+    """
+    named = {name: text for key, text in texts.items() if (name := _REFUSED.sub("_", key))}
+    path = job.sequence.metadata_schema
+    return with_required_types(load_schema(Path(path)), named) if path is not None else dict(named)
 
 
 def _file_name(job: Job, pattern: FileNamePattern, path: AnyPath) -> _Addition:

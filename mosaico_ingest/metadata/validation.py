@@ -10,7 +10,7 @@ from msgspec import Struct
 
 from mosaico_ingest.findings import Edit, Finding, Severity, Span, nearest
 from mosaico_ingest.job.validation import key_path_text
-from mosaico_ingest.job.yaml_source import KeyPath
+from mosaico_ingest.job.yaml_source import KeyPath, resolve_plain
 from mosaico_ingest.metadata.schema import MetadataSchema
 
 _MAX_MESSAGE = 200
@@ -84,6 +84,24 @@ def violations(
     findings = [_finding(problem, spans) for problem in remaining]
     start = Span("", 0, 0, 0, 0)
     return sorted(dict.fromkeys(findings), key=lambda finding: finding.span or start)
+
+
+def with_required_types(schema: MetadataSchema, texts: Mapping[str, str]) -> dict[str, Any]:
+    """Return texts, with a number, boolean or null for each one that violates the schema only because it is a text.
+
+    The value is that of the text as an unquoted YAML value.
+    """
+
+    def wrong_keys(values: Mapping[str, Any]) -> set[str]:
+        try:
+            errors = list(schema.validator.iter_errors(values))
+        except RecursionError:  # `violations` reports the cycle
+            return set()
+        return {str(error.absolute_path[0]) for error in errors if error.absolute_path}
+
+    values = {key: resolve_plain(texts[key])[0] for key in wrong_keys(texts)}
+    refused = wrong_keys(values)
+    return {**texts, **{key: value for key, value in values.items() if key not in refused}}
 
 
 def _finding(problem: Violation, spans: Spans) -> Finding:

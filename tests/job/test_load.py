@@ -147,6 +147,39 @@ def test_load_manifest_variables_are_replaced(tmp_path: Path) -> None:
     assert (manifest.target.host, manifest.target.port, manifest.target.tls) == ("localhost", 12, True)
 
 
+@pytest.mark.parametrize(
+    ("written", "value"),
+    [
+        ("${RUN:int}", 7),
+        ("${NONE:int:-3}", 3),
+        ("${HEIGHT:float}", 1.0),
+        ("${DRY:bool}", True),
+        ("${RUN}", "007"),
+        ("run ${RUN:int}", "run 007"),
+        ("${cell:int}", 5),
+    ],
+)
+def test_load_manifest_variable_with_kind_is_a_value_of_this_type(
+    tmp_path: Path, written: str, value: object
+) -> None:
+    file = tmp_path / "job.yaml"
+    file.write_text(
+        f'bag: {{path: a}}\nsequence:\n  metadata: {{key: ["{written}"]}}\nmatrix: {{cell: [5]}}\n'
+    )
+    manifest = load_manifest(file, env={"RUN": "007", "HEIGHT": "1", "DRY": "True"}).manifest
+    ((loaded,),) = manifest.sequence.metadata.values()
+    assert (loaded, type(loaded)) == (value, type(value))
+
+
+def test_check_manifest_variable_of_another_kind_is_one_located_finding() -> None:
+    text = "bag: {path: x}\nsequence: {metadata: {run: '${RUN:int}', dry: '${DRY:bool}'}}\n"
+    assert check(text, env={"RUN": "seven", "DRY": "1"}) == [
+        ("2:28", "wrong-type", "RUN must be a whole number, not the text 'seven'"),
+        ("2:47", "wrong-type", "DRY must be true or false, not the text '1'"),
+    ]
+    assert [rule for _, rule, _ in check(text, env={})] == ["unset-variable", "unset-variable"]
+
+
 def test_check_manifest_unset_variable_is_finding_with_its_message() -> None:
     text = "bag: {path: x}\ntarget:\n  host: h\n  api_key: ${KEY:?a key with write permission}\n"
     assert check(text, env={}) == [("4:12", "unset-variable", "KEY is not set: a key with write permission")]

@@ -181,6 +181,48 @@ def test_metadata_records_are_read_with_and_without_index(tmp_path: Path, option
     assert plan_of(job).sequence.metadata == {"vehicle": "r1"}
 
 
+def test_metadata_record_with_schema_has_required_types(tmp_path: Path) -> None:
+    entries = {
+        "run": "7",
+        "dry": "true",
+        "mass": "1.5",
+        "vehicle": "12",
+        "either": "8",
+        "note": "x",
+        "open": "3",
+    }
+    write(tmp_path / "r1_7.mcap", {"drive": entries})
+    types: dict[str, Any] = {
+        "run": {"$ref": "#/$defs/run"},
+        "dry": {"type": "boolean"},
+        "mass": {"type": ["number", "null"]},
+        "vehicle": {"type": "string"},
+        "either": {"type": ["integer", "string"]},
+        "note": {},
+    }
+    schema = {"type": "object", "properties": types, "$defs": {"run": {"type": "integer"}}}
+    text = "  metadata_from: {records: [drive]}\n  metadata_schema: vehicle.schema.json\n"
+    job = manifest(tmp_path, text, schema)
+    assert plan_of(job).sequence.metadata == {
+        "run": 7, "dry": True, "mass": 1.5, "vehicle": "12", "either": "8", "note": "x", "open": "3",
+    }  # fmt: skip
+    manifest(tmp_path, text, {**schema, "properties": {**types, "note": {"type": "integer"}}})
+    assert plan_error(job) == (6, [("metadata-schema", "job.yaml", 4, 29)])
+
+
+def test_metadata_variable_with_kind_fulfills_schema(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    write(tmp_path / "r1_7.mcap")
+    monkeypatch.setenv("RUN", "7")
+    text = "  metadata: {{vehicle: r1, run: '{}'}}\n  metadata_schema: vehicle.schema.json\n"
+    job = manifest(tmp_path, text.format("${RUN:int}"))
+    assert places(lint_paths([job], env={"RUN": "7"}).findings) == []
+    assert plan_of(job).sequence.metadata == {"vehicle": "r1", "run": 7}
+    assert plan_error(manifest(tmp_path, text.format("${RUN}"))) == (
+        6,
+        [("metadata-schema", "job.yaml", 4, 32)],
+    )
+
+
 def test_custom_data_is_read_from_record_of_rosbag2(tmp_path: Path) -> None:
     text = "version: 5\nmessage_count: 2\ncustom_data: {vehicle: r1}\n"
     write(tmp_path / "r1_7.mcap", {"rosbag2": {"serialized_metadata": text}})
