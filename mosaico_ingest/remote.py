@@ -161,42 +161,18 @@ def _gs(_bucket: str, options: dict[str, str], network: Network) -> FileSystem:
     )
 
 
-def _az(_container: str, options: dict[str, str], _network: Network) -> FileSystem:
-    """Return the file system of Azure; its client has its own timeouts and retries."""
+def _az(container: str, options: dict[str, str], network: Network) -> FileSystem:
+    from pyarrow import fs  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+
     try:
-        from pyarrow.fs import AzureFileSystem  # noqa: PLC0415 - slow to import, and only jobs with URLs need it
+        from mosaico_ingest.azure_files import AzureFiles  # noqa: PLC0415 - an optional dependency
     except ImportError as error:
         raise IngestError(
-            "this build of pyarrow has no client for az://",
-            hint="install the wheel of pyarrow from PyPI (pip install --only-binary :all: pyarrow)",
+            "obstore is not installed",
+            where=f"az://{container}",
+            hint="pip install 'mosaico-ingest[azure]'",
         ) from error
-    account = options.get("account_name") or _environment(
-        "AZURE_STORAGE_ACCOUNT_NAME", "AZURE_STORAGE_ACCOUNT"
-    )
-    if account is None:
-        raise IngestError(
-            "the URL names no storage account",
-            where=f"az://{_container}",
-            hint="append ?account_name=NAME, or set AZURE_STORAGE_ACCOUNT_NAME",
-        )
-    authority: dict[str, Any] = {}
-    endpoint = options.get("endpoint_override")
-    if endpoint is not None:
-        scheme = options.get("scheme", "https")
-        authority = {
-            "blob_storage_authority": endpoint,
-            "dfs_storage_authority": endpoint,
-            "blob_storage_scheme": scheme,
-            "dfs_storage_scheme": scheme,
-        }
-    key = _environment("AZURE_STORAGE_KEY", "AZURE_STORAGE_ACCOUNT_KEY")
-    token = None if key else _environment("AZURE_STORAGE_SAS_TOKEN")
-    return AzureFileSystem(account_name=account, account_key=key, sas_token=token, **authority)
-
-
-def _environment(*names: str) -> str | None:
-    """Return the value of the first environment variable that is set."""
-    return next((value for name in names if (value := os.environ.get(name))), None)
+    return fs.PyFileSystem(AzureFiles(container, options, network))
 
 
 _Factory = Callable[[str, "dict[str, str]", Network], "FileSystem"]
@@ -378,16 +354,13 @@ class RemotePath:
             FileNotFoundError: The object does not exist.
         """
         with translate_errors(str(self)):
+            properties = self._properties(cached=False)
+            if properties is not None:
+                return f"{properties.size} {properties.version}"
             opened = file or self.open_input()
-            if self.is_web:
-                return self._web_version()
             metadata = {str(name).lower(): bytes(value).decode() for name, value in opened.metadata().items()}
             tag = next((metadata[name] for name in ("etag", "generation") if metadata.get(name)), None)
             return f"{opened.size()} {tag or self.now().stat().st_mtime_ns}"
-
-    def _web_version(self) -> str:
-        properties = self._web_properties(cached=False)
-        return f"{properties.size} {properties.version}"
 
     @property
     def has_ranges(self) -> bool:
@@ -396,13 +369,15 @@ class RemotePath:
         Raises:
             FileNotFoundError: The file does not exist.
         """
-        if not self.is_web:
-            return True
         with translate_errors(str(self)):
-            return self._web_properties(cached=True).has_ranges
+            properties = self._properties(cached=True)
+        return properties is None or properties.has_ranges
 
-    def _web_properties(self, *, cached: bool) -> Properties:
-        handler: Any = self.filesystem.handler  # pyright: ignore[reportAttributeAccessIssue] - web URLs have a `PyFileSystem`, which has a handler
+    def _properties(self, *, cached: bool) -> Properties | None:
+        """Return the properties of the file, None for the file systems of pyarrow itself."""
+        handler: Any = getattr(self.filesystem, "handler", None)
+        if handler is None:
+            return None
         properties = handler.properties(self.filesystem_path, cached=cached)
         if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))

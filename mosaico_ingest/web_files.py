@@ -177,42 +177,61 @@ class WebFiles(FileSystemHandler):
     delete_file = move = copy_file = open_output_stream = open_append_stream = _refused
 
 
-class _WebFile(RawIOBase):
+class RangedFile(RawIOBase):
+    """A file for random access; subclasses fetch a range."""
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self._size = size
+        self._position = 0
+
+    def fetch(self, start: int, end: int) -> bytes:
+        """Return the bytes of a range inside the file; fewer only if the file has become shorter."""
+        raise NotImplementedError
+
+    def readable(self) -> bool:
+        """Return True."""
+        return True
+
+    def seekable(self) -> bool:
+        """Return True."""
+        return True
+
+    def tell(self) -> int:
+        """Return the position."""
+        return self._position
+
+    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
+        """Change the position, and return it."""
+        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._size}[whence]
+        self._position = base + offset
+        return self._position
+
+    def read(self, size: int | None = -1) -> bytes:
+        """Return the next bytes; fewer only at the end of the file."""
+        end = self._size if size is None or size < 0 else min(self._position + size, self._size)
+        if end <= self._position:
+            return b""
+        data = self.fetch(self._position, end)
+        self._position += len(data)
+        return data
+
+
+class _WebFile(RangedFile):
     """A file that reads each range with one request, or consecutive ranges from one response if the server ignores ranges."""
 
     def __init__(self, files: WebFiles, path: str, properties: Properties) -> None:
-        super().__init__()
+        super().__init__(properties.size)
         self._files = files
         self._path = path
-        self._properties = properties
-        self._position = 0
+        self._has_ranges = properties.has_ranges
         self._complete: tuple[Any, str] | None = None
         """A response with the complete file, and its URL."""
         self._received = 0
         """Number of bytes read from the response."""
 
-    def readable(self) -> bool:
-        return True
-
-    def seekable(self) -> bool:
-        return True
-
-    def tell(self) -> int:
-        return self._position
-
-    def seek(self, offset: int, whence: int = os.SEEK_SET) -> int:
-        base = {os.SEEK_SET: 0, os.SEEK_CUR: self._position, os.SEEK_END: self._properties.size}[whence]
-        self._position = base + offset
-        return self._position
-
-    def read(self, size: int | None = -1) -> bytes:
-        file_size = self._properties.size
-        end = file_size if size is None or size < 0 else min(self._position + size, file_size)
-        if end <= self._position:
-            return b""
-        data = self._read_range(end) if self._properties.has_ranges else self._read_on(end)
-        self._position += len(data)
-        return data
+    def fetch(self, start: int, end: int) -> bytes:
+        return self._read_range(start, end) if self._has_ranges else self._read_on(start, end)
 
     def close(self) -> None:
         self._drop_response()
@@ -223,25 +242,24 @@ class _WebFile(RawIOBase):
             _discard(self._complete[0])
             self._complete = None
 
-    def _read_range(self, end: int) -> bytes:
-        response, where = self._files.request(self._path, self._position, end)
+    def _read_range(self, start: int, end: int) -> bytes:
+        response, where = self._files.request(self._path, start, end)
         try:
             if response.status == _UNSATISFIABLE:
                 return b""
-            return self._files.read(response, where, end - self._position)
+            return self._files.read(response, where, end - start)
         finally:
             _discard(response)
 
-    def _read_on(self, end: int) -> bytes:
+    def _read_on(self, start: int, end: int) -> bytes:
         """Read from the response with the complete file; request it again if its position is after the range."""
-        if self._received > self._position:
+        if self._received > start:
             self._drop_response()
         if self._complete is None:
             self._complete, self._received = self._files.request(self._path, 0, end), 0
-        while self._received < self._position:
-            skipped_bytes = min(self._position - self._received, _SKIP_BYTES)
-            self._received += len(self._files.read(*self._complete, skipped_bytes))
-        data = self._files.read(*self._complete, end - self._position)
+        while self._received < start:
+            self._received += len(self._files.read(*self._complete, min(start - self._received, _SKIP_BYTES)))
+        data = self._files.read(*self._complete, end - start)
         self._received += len(data)
         return data
 

@@ -425,7 +425,7 @@ class NetworkSettings(Section):
 
     attempts: Annotated[int, Field(ge=1, le=100)] = 5
     """Maximum number of attempts per request; the delay between attempts doubles. Google Cloud Storage retries for the time of
-    `timeout` instead, and Azure uses the defaults of its client."""
+    `timeout` instead."""
     connect_timeout: Duration = Field(default=5 * 10**9, examples=["10 s"])
     """Maximum time to establish a connection."""
     timeout: Duration = Field(default=30 * 10**9, examples=["2 min"])
