@@ -31,6 +31,7 @@ def color_map(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
     """Return measurements of shape (height, width) as RGB; zeros, NaN and infinities are black.
 
     The colors span the range from the 1st to the 99th percentile, so that outliers do not hide the rest.
+    If all measurements are equal, they have the color in the middle.
     """
     mask = np.isfinite(values) & (values != 0)
     pixels = np.zeros((*values.shape, 3), np.uint8)
@@ -38,7 +39,8 @@ def color_map(values: npt.NDArray[Any]) -> npt.NDArray[np.uint8]:
         return pixels
     depths = values[mask].astype(np.float64)
     low, high = (float(bound) for bound in np.percentile(depths, _PERCENTILES))
-    share = np.clip((depths - low) / (high - low if high > low else 1.0), 0, 1) * (len(_TURBO) - 1)
+    share = np.clip((depths - low) / (high - low), 0, 1) if high > low else np.full(depths.shape, 0.5)
+    share *= len(_TURBO) - 1
     steps = np.arange(len(_TURBO))
     for channel in range(3):
         pixels[..., channel][mask] = np.rint(np.interp(share, steps, _TURBO[:, channel]))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -19,8 +20,10 @@ from mosaico_ingest.view.logs import has_log, log_lines
 from mosaico_ingest.view.pictures import row_codec
 from mosaico_ingest.view.series import plot_fields, read_series
 from mosaico_ingest.view.tracks import has_track, read_track
+from mosaico_ingest.view.transforms import FrameNode, frame_trees, has_transforms, read_edges
 
-TIMELINE = "log_time"
+TIMELINE = "time"
+"""Name of the timeline. The viewer adds a timeline `log_time` of its own, which has the times of this process."""
 MAX_POINTS = 100_000
 """Points per scalar series and track; extreme values are kept."""
 MAX_PLOTS = 6
@@ -30,6 +33,8 @@ _DIRECT = {b"\xff\xd8\xff": "image/jpeg", b"\x89PNG": "image/png"}
 """Image files that the viewer decodes itself, by their first bytes."""
 _CODECS = {"hevc": "H265"}
 """The viewer's name of each codec for which it has another one."""
+_AXIS_M = 0.3
+"""Length of the axes that show a coordinate frame."""
 _LEVELS = {"debug": "DEBUG", "warning": "WARN", "error": "ERROR", "stale": "WARN", "fatal": "CRITICAL"}
 """The viewer's name of each level that is not INFO."""
 
@@ -40,6 +45,10 @@ class ViewedTopic:
     def __init__(self, topic: TopicInfo) -> None:
         self.topic = topic
         self.kinds: list[str] = []
+        self.frames: dict[str, None] = {}
+        """Coordinate frames of the points and positions, in the order of their first row."""
+        self.is_constant = True
+        """Whether no plotted number changes."""
         self.problems: dict[str, int] = {}
         """Number of rows by the reason why they are not shown."""
 
@@ -92,14 +101,14 @@ class _Sender:
         elif has_points(schema):
             viewed.kinds.append("points")
             self._send_rows(viewed, self._points)
-        elif "transforms" in schema.names:
+        elif has_transforms(topic):
             viewed.kinds.append("transforms")
             self._send_rows(viewed, self._transforms)
+        elif has_log(topic):
+            self._send_logs(viewed)
         else:
             if has_track(topic):
                 self._send_track(viewed)
-            if has_log(topic):
-                self._send_logs(viewed)
             self._send_scalars(viewed)
         return viewed
 
@@ -143,34 +152,35 @@ class _Sender:
 
     def _points(self, viewed: ViewedTopic, row: Mapping[str, Any]) -> None:
         points = row_points(row)
-        self._frame(viewed.path, row)
+        frame = (row.get("header") or {}).get("frame_id")
+        if frame:
+            self._attach(viewed, viewed.path, frame)
         shades = points.xyz[:, 2] if points.values is None else points.values
         colors = color_map(shades[np.newaxis].astype(np.float64) + 1e-9)[0] if len(shades) else None
         self._recording.log(viewed.path, self._rerun.Points3D(points.xyz, colors=colors))
 
-    def _frame(self, path: str, row: Mapping[str, Any]) -> None:
-        """Attach an entity to the coordinate frame of a row."""
-        frame = (row.get("header") or {}).get("frame_id")
-        if frame:
-            self._recording.log(path, self._rerun.CoordinateFrame(str(frame).removeprefix("/")))
+    def _attach(self, viewed: ViewedTopic, path: str, frame: str, *, static: bool = False) -> None:
+        """Attach an entity to a coordinate frame."""
+        name = _frame_name(frame)
+        viewed.frames[name] = None
+        self._recording.log(path, self._rerun.CoordinateFrame(name), static=static)
 
     def _transforms(self, viewed: ViewedTopic, row: Mapping[str, Any]) -> None:
-        for transform in row["transforms"] or ():
-            inner = transform.get("transform") or transform  # the message of ROS nests the transform
-            parent = (transform.get("header") or {}).get("frame_id")
-            child = transform.get("target_frame_id") or transform.get("child_frame_id")
+        for transform in row.get("transforms", [row]) or ():
+            parent, child = (transform["header"] or {}).get("frame_id"), transform["target_frame_id"]
             if not parent or not child:
                 viewed.add_problem(ViewError("a transform does not name its frames"))
                 continue
-            translation, rotation = inner["translation"], inner["rotation"]
+            translation, rotation = transform["translation"], transform["rotation"]
             self._recording.log(
-                f"{viewed.path}/{str(child).strip('/')}",
+                f"{viewed.path}/{_frame_name(child)}",
                 self._rerun.Transform3D(
                     translation=[translation[axis] for axis in "xyz"],
                     quaternion=[rotation[axis] for axis in "xyzw"],
-                    parent_frame=str(parent).removeprefix("/"),
-                    child_frame=str(child).removeprefix("/"),
+                    parent_frame=_frame_name(parent),
+                    child_frame=_frame_name(child),
                 ),
+                self._rerun.TransformAxes3D(_AXIS_M),
             )
 
     def _send_track(self, viewed: ViewedTopic) -> None:
@@ -188,9 +198,8 @@ class _Sender:
         else:
             viewed.kinds.append("trajectory")
             if track.frame_id:
-                frame = rerun.CoordinateFrame(track.frame_id.removeprefix("/"))
                 for path in (f"{viewed.path}/track", f"{viewed.path}/position"):
-                    self._recording.log(path, frame, static=True)
+                    self._attach(viewed, path, track.frame_id, static=True)
             self._recording.log(f"{viewed.path}/track", rerun.LineStrips3D([track.positions]), static=True)
             columns = rerun.Points3D.columns(positions=track.positions)
         self._recording.send_columns(f"{viewed.path}/position", index, columns)
@@ -225,6 +234,7 @@ class _Sender:
             self._recording.send_columns(
                 path, index, self._rerun.Scalars.columns(scalars=series.values[finite])
             )
+            viewed.is_constant = viewed.is_constant and not np.ptp(series.values[finite])
             if "plot" not in viewed.kinds:
                 viewed.kinds.append("plot")
 
@@ -232,42 +242,77 @@ class _Sender:
         return self._rerun.TimeColumn(TIMELINE, timestamp=times_ns.astype("datetime64[ns]"))
 
 
+def _frame_name(frame_id: object) -> str:
+    """Return the name of a coordinate frame without the slash with which ROS 1 starts it."""
+    return str(frame_id).removeprefix("/")
+
+
 def _blueprint(viewed: list[ViewedTopic]) -> Any:  # noqa: ANN401 - a class of the SDK, which has no stubs for it
-    """Return the layout: space and map above, cameras in the middle, plots and logs below."""
+    """Return the layout: spaces and map above, cameras in the middle, plots and logs below."""
     blueprint = import_module("rerun.blueprint")
     by_kind = {
-        kind: [each for each in viewed if kind in each.kinds]
-        for kind in ("points", "trajectory", "transforms", "map", "image", "plot", "logs")
+        kind: [each for each in viewed if kind in each.kinds] for kind in ("map", "image", "plot", "logs")
     }
-    space = [each for kind in ("points", "trajectory", "transforms") for each in by_kind[kind]]
-    rows: list[Any] = []
-    above: list[Any] = []
-    if space:
-        contents = [f"{each.path}/**" for each in space]
-        above.append(blueprint.Spatial3DView(origin="/", contents=contents, name="space"))
+    above = [
+        blueprint.Spatial3DView(
+            origin="/",
+            contents=contents,
+            name=frame or "space",
+            spatial_information=blueprint.SpatialInformation(frame) if frame else None,
+        )
+        for frame, contents in spaces(viewed).items()
+    ]
     if by_kind["map"]:
-        above.append(
-            blueprint.MapView(origin="/", contents=[f"{each.path}/**" for each in by_kind["map"]], name="map")
-        )
-    if above:
-        rows.append(blueprint.Horizontal(*above))
-    if by_kind["image"]:
-        rows.append(
-            blueprint.Grid(
-                *(blueprint.Spatial2DView(origin=each.path, name=each.path) for each in by_kind["image"])
-            )
-        )
+        contents = [f"{each.path}/**" for each in by_kind["map"]]
+        above.append(blueprint.MapView(origin="/", contents=contents, name="map"))
+    cameras = [blueprint.Spatial2DView(origin=each.path, name=each.path) for each in by_kind["image"]]
     below = [
         blueprint.TimeSeriesView(origin=f"{each.path}/plot", name=each.path)
-        for each in by_kind["plot"][:MAX_PLOTS]
+        for each in sorted(by_kind["plot"], key=lambda each: each.is_constant)[:MAX_PLOTS]
     ]
     if by_kind["logs"]:
-        below.append(
-            blueprint.TextLogView(origin="/", contents=[each.path for each in by_kind["logs"]], name="logs")
-        )
-    if below:
-        rows.append(blueprint.Tabs(*below) if len(below) > 3 else blueprint.Horizontal(*below))  # noqa: PLR2004 - views that fit side by side
-    return blueprint.Blueprint(blueprint.Vertical(*rows), collapse_panels=True)
+        contents = [each.path for each in by_kind["logs"]]
+        below.append(blueprint.TextLogView(origin="/", contents=contents, name="logs"))
+    rows = [
+        *([_row(blueprint, above)] if above else []),
+        *([blueprint.Grid(*cameras)] if cameras else []),
+        *([_row(blueprint, below)] if below else []),
+    ]
+    time_panel = blueprint.TimePanel(timeline=TIMELINE, state="collapsed")
+    return blueprint.Blueprint(blueprint.Vertical(*rows), time_panel, collapse_panels=True)
+
+
+def _row(blueprint: ModuleType, views: list[Any]) -> Any:  # noqa: ANN401 - a class of the SDK, which has no stubs for it
+    """Return views side by side if they fit, otherwise as tabs."""
+    return blueprint.Tabs(*views) if len(views) > 3 else blueprint.Horizontal(*views)  # noqa: PLR2004 - views that fit
+
+
+def spaces(viewed: list[ViewedTopic]) -> dict[str, list[str]]:
+    """Return the paths of entities with positions by the frame in which the viewer shows them; "" is no frame.
+
+    The viewer can show entities together only if transforms connect their frames, so each tree of frames has a space.
+    """
+    edges = [edge for edge in read_edges(each.topic for each in viewed) if edge.parent and edge.child]
+    roots = {
+        _frame_name(name): _frame_name(tree.name) for tree in frame_trees(edges) for name in _frame_ids(tree)
+    }
+    spaces: dict[str, list[str]] = {}
+    for edge in edges:
+        child = _frame_name(edge.child)
+        spaces.setdefault(roots[child], []).append(f"{edge.topic}/{child}")
+    for each in viewed:
+        if not {"points", "trajectory"}.isdisjoint(each.kinds):
+            frame = next(iter(each.frames), "")
+            spaces.setdefault(roots.get(frame, frame), []).append(f"{each.path}/**")
+    return spaces
+
+
+def _frame_ids(tree: FrameNode) -> list[str]:
+    """Return the frames of a tree, which can be deeper than recursion can be."""
+    nodes = [tree]
+    for node in nodes:  # grows while it is iterated
+        nodes += node.children
+    return [node.name for node in nodes]
 
 
 def _rerun() -> Any:  # noqa: ANN401 - a module

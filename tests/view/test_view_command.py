@@ -16,7 +16,7 @@ import mosaico_ingest
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.view.rerun_recording import send_sequence
+from mosaico_ingest.view.rerun_recording import ViewedTopic, send_sequence, spaces
 
 
 @pytest.fixture
@@ -38,7 +38,7 @@ def output(quickstart: Store, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
 
 def entities(path: Path) -> str:
     """Return what Rerun's own tool prints about a file."""
-    command = [sys.executable, "-m", "rerun", "rrd", "print", str(path)]
+    command = [sys.executable, "-m", "rerun", "rrd", "print", "-vv", str(path)]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout  # noqa: S603 - Rerun's tool
 
 
@@ -60,6 +60,7 @@ def test_view_save_writes_entities_of_every_kind(output: Callable[..., str]) -> 
         "/lidar/points",
     ):
         assert f"{entity}" in text, entity
+    assert "index_name: time " in text  # the SDK adds `log_time`, the time of the call
 
 
 @pytest.mark.slow
@@ -98,6 +99,21 @@ def test_view_without_rerun_names_the_extra(
 ) -> None:
     monkeypatch.setitem(sys.modules, "rerun", None)
     assert "mosaico-ingest[view]" in output("--save", "x.rrd", code=1)
+
+
+def test_spaces_of_quickstart_are_those_of_its_trees_of_frames(quickstart: Store) -> None:
+    """The frame of the lidar is not connected with that of the odometry, so one space cannot show both."""
+    viewed = []
+    for name, kind, frame in (
+        ("/odom", "trajectory", "odom"),
+        ("/lidar/points", "points", "lidar"),
+        ("/tf", "transforms", None),
+    ):
+        each = ViewedTopic(quickstart.sequence("quickstart_drive").topic(name))
+        each.kinds.append(kind)
+        each.frames.update({frame: None} if frame else {})
+        viewed.append(each)
+    assert spaces(viewed) == {"odom": ["/tf/base_link", "/odom/**"], "lidar": ["/lidar/points/**"]}
 
 
 LOG = OntologyType(
