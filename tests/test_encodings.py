@@ -124,7 +124,7 @@ def test_export_restores_protobuf_and_json_recordings(tmp_path: Path, ingest: An
     report = export_sequence(Store.open(tmp_path / "store"), "s", tmp_path / "again.mcap")
     assert report.faithful
     before, after = (
-        sorted(repr((one.topic, one.timestamp_ns, one.msg_type, one.data)) for one in ROSLoader(path))
+        sorted(repr((one.topic, one.timestamp_ns, one.msg_type, one.data)) for one, _ in ROSLoader(path))
         for path in (source, tmp_path / "again.mcap")
     )
     assert before == after
@@ -158,7 +158,7 @@ def test_export_keeps_absent_fields_absent(tmp_path: Path, ingest: Any) -> None:
     ingest(source)
     assert export_sequence(Store.open(tmp_path / "store"), "s", tmp_path / "again.mcap").faithful
     before, after = (
-        sorted(repr((one.topic, one.timestamp_ns, one.data)) for one in ROSLoader(path))
+        sorted(repr((one.topic, one.timestamp_ns, one.data)) for one, _ in ROSLoader(path))
         for path in (source, tmp_path / "again.mcap")
     )
     assert before == after

@@ -110,7 +110,7 @@ def test_stand_in_of_2023_is_refused_by_the_reader_of_the_sdk(r2b: ModuleType, t
     ):
         list(loader)
     with ROSLoader(folder, get_typestore(Stores.ROS2_HUMBLE), error_policy="raise") as loader:
-        assert [message.data["encoding"] for message in loader] == ["bgr8"]
+        assert [message.data["encoding"] for message, _ in loader] == ["bgr8"]
 
 
 @pytest.mark.slow

@@ -328,9 +328,9 @@ def _decoded_values(quarantine: Path, selected: set[tuple[str, int]]) -> dict[tu
         if quarantine.stat().st_size > MAX_DECODED_BYTES:
             return {}
         with ROSLoader(quarantine, error_policy=LoaderErrorPolicy.IGNORE) as messages:
-            for message in messages:
+            for message, error in messages:
                 key = (message.topic, message.timestamp_ns)
-                if key in selected:
+                if error is None and key in selected:
                     values.setdefault(key, value_text(message.data, VALUE_WIDTH))
                     if len(values) == len(selected):
                         break

@@ -7,10 +7,11 @@ merges the tasks of all splits by time, and yields `MessageBlock`s whose connect
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
-from typing import Any, Protocol, TypeVar, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar, runtime_checkable
 
 import numpy as np
 from msgspec import Struct, field
@@ -20,6 +21,9 @@ from numpy.typing import NDArray
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
+
+if TYPE_CHECKING:
+    from mosaico_ingest.ontology.header import Time
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The range of int64 nanosecond timestamps; the latest is in the year 2262."""
@@ -273,6 +277,13 @@ class ROSHeader(Struct, frozen=True):
     seq: int | None = None
     """Sequence number; None in ROS 2."""
 
+    @property
+    def stamp(self) -> Time:
+        """`stamp` as a time of the ontology."""
+        from mosaico_ingest.ontology.header import Time  # noqa: PLC0415 - imports pydantic
+
+        return Time.from_nanoseconds(self.stamp_ns)
+
 
 @dataclass(frozen=True)
 class ROSMessage:
@@ -284,7 +295,16 @@ class ROSMessage:
     msg_type: str
     """`pkg/msg/Name`."""
     data: dict[str, Any]
-    """Nested messages are dictionaries, arrays are lists, `uint8[]`, `byte[]` and `char[]` are `bytes`."""
+    """Nested messages are dictionaries, arrays are lists, `uint8[]`, `byte[]` and `char[]` are `bytes`.
+
+    Empty if the message cannot be decoded."""
+    const_data: Mapping[str, Any] | None = dataclasses.field(default=None, compare=False)
+    """The constants of the message type by name."""
+
+    @property
+    def data_field(self) -> dict[str, Any] | None:
+        """`data`, or None if it is empty; the name in SDK 0.7."""
+        return self.data or None
 
     @property
     def timestamp_ns(self) -> int:

@@ -50,8 +50,9 @@ class _Source(Protocol):
 class ROSLoader:
     """The messages of a recording on selected topics. Iterate it, once or several times, and close it.
 
-    Messages that do not match their definition are skipped and counted in `rejected`; the error policy decides whether
-    they are also logged, or raised. Damage of the files is listed in `unreadable` after an iteration.
+    Each item is a message and an exception, as in the official SDK. The exception is None unless the message cannot be
+    decoded; such messages have no data and are counted in `rejected`, and the error policy decides whether they are also
+    logged, or raised. Damage of the files is listed in `unreadable` after an iteration.
     """
 
     def __init__(
@@ -97,7 +98,7 @@ class ROSLoader:
             self.close()
             raise
         self.rejected = Counter[str]()
-        """Number of messages that the last iteration skipped, by topic."""
+        """Number of messages that the last iteration could not decode, by topic."""
 
     def __enter__(self) -> Self:
         return self
@@ -161,38 +162,42 @@ class ROSLoader:
             return sum(1 for _ in self._source.payloads([connection.id for connection in connections]))
         return sum(count for count in counts if count is not None)
 
-    def __iter__(self) -> Iterator[ROSMessage]:
-        """Yield the messages by log time.
+    def __iter__(self) -> Iterator[tuple[ROSMessage, Exception | None]]:
+        """Yield the messages by log time, each with the reason why it cannot be decoded, or None.
 
         Raises:
             BagError: The recording is unreadable; or, with the policy `raise`, a message or a definition is.
         """
         self.rejected.clear()
         deserializers = {key: self._deserializer(one) for key, one in self._connections.items()}
+        constants = {key: _constants(one) for key, one in self._connections.items()}
         for log_ns, connection_id, payload in self._source.payloads(self._connections):
             connection, deserialize = self._connections[connection_id], deserializers[connection_id]
-            if deserialize is None:
-                self.rejected[connection.topic] += 1
-                continue
+            data, problem = dict[str, Any](), None
             try:
                 data = deserialize(payload)
             except DecodeError as error:
                 self._reject(connection, log_ns, error)
-                continue
-            yield ROSMessage(log_ns, connection.topic, connection.msgtype, data)
+                problem = error
+            message = ROSMessage(log_ns, connection.topic, connection.msgtype, data, constants[connection_id])
+            yield message, problem
         if self._policy is LoaderErrorPolicy.LOG_WARN:
             for topic, count in self.rejected.items():
                 _LOG.warning("%s: %d messages could not be read", topic, count)
 
-    def _deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]] | None:
+    def _deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]]:
+        """Return the deserializer of a connection, which raises for every message if there is none."""
         deserialize = self._source.deserializer(connection)
-        if deserialize is None:
-            problem = connection.problem or "it cannot be decoded"
-            if self._policy is LoaderErrorPolicy.RAISE:
-                raise BagError(problem, where=connection.topic)
-            if self._policy is LoaderErrorPolicy.LOG_WARN:
-                _LOG.warning("%s: %s", connection.topic, problem)
-        return deserialize
+        if deserialize is not None:
+            return deserialize
+        problem = connection.problem or "it cannot be decoded"
+        if self._policy is LoaderErrorPolicy.RAISE:
+            raise BagError(problem, where=connection.topic)
+
+        def refuse(payload: bytes) -> dict[str, Any]:  # noqa: ARG001 - the signature of a deserializer
+            raise DecodeError(problem, rule="definition")
+
+        return refuse
 
     def _reject(self, connection: Connection, log_ns: int, error: DecodeError) -> None:
         """Raise or count a message that cannot be decoded; log the first of each topic."""
@@ -202,6 +207,12 @@ class ROSLoader:
         if not self.rejected[connection.topic] and self._policy is LoaderErrorPolicy.LOG_WARN:
             _LOG.warning("%s: %s", connection.topic, error)
         self.rejected[connection.topic] += 1
+
+
+def _constants(connection: Connection) -> dict[str, Any]:
+    """Return the constants of a connection's type by name."""
+    definition = connection.definition
+    return {} if definition is None else {one.name: one.value for one in definition.message.constants}
 
 
 class _NativeSource:

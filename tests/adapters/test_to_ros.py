@@ -49,7 +49,7 @@ def test_to_ros_image_data_is_a_numpy_array() -> None:
 def test_to_ros_of_every_topic_serializes_to_the_recorded_fields(request: pytest.FixtureRequest) -> None:
     path = request.config.rootpath / QUICKSTART
     with ROSLoader(path, HUMBLE, ["!/camera/image_raw", "!/battery"]) as loader:
-        messages = {message.topic: message for message in loader}
+        messages = {message.topic: message for message, _ in loader}
     assert len(messages) == 8
     for message in messages.values():
         adapter = ROSBridge.get_default_adapter(message.msg_type)

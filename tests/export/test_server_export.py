@@ -363,7 +363,7 @@ def test_loader_of_a_server_yields_the_messages_of_the_recording(server: Server)
         with pytest.raises(NothingMatched, match="/odom"):
             loader.msg_count("/odom")
     with ROSLoader(DRIVE, topics=topics) as recording:
-        assert by_topic(restored) == by_topic(recording)
+        assert by_topic(restored) == by_topic(message for message, _ in recording)
         assert (loader.topics, loader.duration > 0) == (recording.topics, True)
     assert counts == (len(restored), 1000)
     times = [message.bag_timestamp_ns for message in restored]

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import runpy
 import sys
+from contextlib import closing
 from dataclasses import fields
+from importlib import import_module
 from pathlib import Path
 from random import Random
 from typing import Any
@@ -12,6 +14,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 import pytest
+import rosbags.typesys
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
@@ -19,6 +22,8 @@ from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
+from mosaico_ingest.rosbag.writers import open_writer
 
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")
@@ -159,3 +164,36 @@ def test_migration_page_lists_every_setting_of_the_sdk() -> None:
     page = (Path(__file__).parents[2] / "docs" / "migration.md").read_text(encoding="utf-8")
     missing = {field.name for field in fields(sdk.ROSInjectionConfig) if f"`{field.name}`" not in page}
     assert missing == set()
+
+
+@pytest.mark.parametrize("suffix", [".mcap", ".bag"])
+def test_program_that_iterates_a_loader_sees_the_same_messages_with_both_packages(
+    tmp_path: Path, suffix: str
+) -> None:
+    distro = Stores.ROS1_NOETIC if suffix == ".bag" else Stores.ROS2_HUMBLE
+    definition = TypeResolver(distro).resolve(
+        "geometry_msgs/msg/PointStamped", None, ros_version=1 if suffix == ".bag" else 2
+    )
+    header = {"seq": 1, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "map"}
+    message = {"header": header, "point": {"x": 1.0, "y": 2.0, "z": 3.0}}
+    payload = MESSAGE_ENCODINGS[encoding_of(definition)].writer(definition).from_dict(message)
+    recording = tmp_path / f"r{suffix}"
+    with open_writer(recording) as writer:
+        connection = writer.add_connection("/point", definition)
+        for log_ns, data in enumerate((payload, payload[:-8], payload), 1):
+            writer.write(connection, log_ns, data)
+    outcomes: list[list[Any]] = []
+    for package in ("mosaicolabs", "mosaico_ingest"):
+        module = import_module(f"{package}.bridges.ros")
+        distros = rosbags.typesys.Stores
+        with closing(module.ROSLoader(recording, distros(distro.value), ["/point"])) as loader:
+            outcomes.append([_attributes(message, error) for message, error in loader])
+    assert [outcome[-1] for outcome in outcomes[0]] == [True, False, True]
+    assert outcomes[0] == outcomes[1]
+
+
+def _attributes(message: Any, error: Exception | None) -> tuple[Any, ...]:
+    stamp = message.header and (message.header.stamp.seconds, message.header.stamp.nanoseconds)
+    constants = message.const_data or None
+    names = (message.topic, message.bag_timestamp_ns, message.msg_type, message.data_field)
+    return (*names, constants, stamp, error is None)

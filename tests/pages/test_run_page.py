@@ -290,7 +290,7 @@ def test_run_page_quarantined_message_that_can_be_decoded_shows_its_values(
     (one,) = read_report(Path("run.json")).recordings
     rejected = next(topic for topic in one.topics if topic.quarantined)
     with ROSLoader("configs/quickstart/drive.mcap", topics=rejected.topic) as messages:
-        values = {each.timestamp_ns: value_text(each.data, VALUE_WIDTH) for each in messages}
+        values = {each.timestamp_ns: value_text(each.data, VALUE_WIDTH) for each, _ in messages}
     examples = RecordingView(0, run(one), tmp_path).examples
     assert examples
     assert [example.values for example in examples] == [values[example.log_time_ns] for example in examples]

@@ -89,7 +89,7 @@ def test_loader_reads_every_container(tmp_path: Path, suffix: str) -> None:
         write_recording(path, plugin)
         expected = set(MESSAGES)
     with ROSLoader(path, Stores.ROS2_HUMBLE, custom_types=CUSTOM, error_policy="raise") as loader:
-        assert {message.topic for message in loader} == expected
+        assert {message.topic for message, _ in loader} == expected
 
 
 @pytest.mark.promise("loader-globs")

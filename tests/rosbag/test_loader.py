@@ -61,23 +61,27 @@ def bag(tmp_path: Path, request: pytest.FixtureRequest) -> Path:
 def test_loader_yields_messages_by_log_time(bag: Path) -> None:
     with ROSLoader(bag) as loader:
         messages = list(loader)
-    times = [message.timestamp_ns for message in messages]
+    times = [message.timestamp_ns for message, _ in messages]
     assert times == sorted(times)
-    assert len(messages) == 20 + 9 + 1
+    assert len(messages) == 20 + 10 + 1
+    [(message, error)] = [(message, error) for message, error in messages if error is not None]
+    assert (message.topic, message.timestamp_ns, message.data) == ("/text", 8 * SECOND, {})
+    assert isinstance(error, DecodeError)
     assert loader.rejected == {"/text": 1}
 
 
 def test_loader_message_has_fields_by_name(bag: Path) -> None:
     with ROSLoader(bag, topics="/mine") as loader:
-        (message,) = loader
+        ((message, _),) = loader
     assert message == ROSMessage(3 * SECOND, "/mine", "mine/msg/Own", {"blob": b"abc", "from": 7})
     assert message.header is None
 
 
 def test_message_header_is_parsed_or_none(bag: Path) -> None:
     with ROSLoader(bag, topics=["/point"]) as loader:
-        message = next(iter(loader))
+        message, _ = next(iter(loader))
     assert message.header == ROSHeader(stamp_ns=5, frame_id="map")
+    assert message.header.stamp.to_nanoseconds() == 5
     assert ROSMessage(0, "/t", "a/msg/B", {"header": 5}).header is None
     ros1 = {"header": {"seq": 4, "stamp": {"sec": 1, "nanosec": 2}, "frame_id": "f"}}
     assert ROSMessage(0, "/t", "a/msg/B", ros1).header == ROSHeader(SECOND + 2, "f", 4)
@@ -96,7 +100,8 @@ def test_time_slices_beyond_limit_are_halved(bag: Path, max_bytes: int) -> None:
 
 def test_loader_iterates_repeatedly(bag: Path) -> None:
     with ROSLoader(bag) as loader:
-        assert list(loader) == list(loader)
+        first, second = list(loader), list(loader)
+        assert [message for message, _ in first] == [message for message, _ in second]
         assert loader.rejected == {"/text": 1}
 
 
@@ -163,7 +168,10 @@ class TestDefinitions:
 
     def test_unknown_type_rejects_only_its_topic(self, old_bag: Path) -> None:
         with ROSLoader(old_bag, error_policy="ignore") as loader:
-            assert [message.topic for message in loader] == ["/text"]
+            assert [(message.topic, error is None) for message, error in loader] == [
+                ("/text", True),
+                ("/mine", False),
+            ]
             assert loader.rejected == {"/mine": 1}
             assert any(finding.rule == "assumed-definition" for finding in loader.findings)
 
@@ -178,7 +186,7 @@ class TestDefinitions:
         with ROSLoader(
             old_bag, Stores.ROS2_HUMBLE, ["/mine"], custom_types={"mine/msg/Own": "int8 x"}
         ) as loader:
-            assert [message.data for message in loader] == [{"x": 5}]
+            assert [message.data for message, _ in loader] == [{"x": 5}]
 
 
 def test_loader_reads_ros1_bag(tmp_path: Path) -> None:
@@ -190,7 +198,7 @@ def test_loader_reads_ros1_bag(tmp_path: Path) -> None:
         connection = writer.add_connection("/header", "std_msgs/msg/Header", typestore=store)
         writer.write(connection, 5, Serializer(known, Encoding.ROS1).from_dict(values))
     with ROSLoader(str(path)) as loader:
-        assert list(loader) == [ROSMessage(5, "/header", "std_msgs/msg/Header", values)]
+        assert [message for message, _ in loader] == [ROSMessage(5, "/header", "std_msgs/msg/Header", values)]
 
 
 def test_loader_missing_file_raises(tmp_path: Path) -> None:
@@ -218,8 +226,9 @@ def test_loader_with_typestore_uses_its_definitions(tmp_path: Path) -> None:
         database.execute("DROP TABLE message_definitions")
         database.commit()
     with ROSLoader(path, "ros2_humble", error_policy="ignore") as loader:
-        assert (loader.resolved_topics, list(loader)) == ([], [])
+        assert loader.resolved_topics == []
+        assert [(message.data_field, type(error)) for message, error in loader] == [(None, DecodeError)]
     with ROSLoader(path, typestore) as loader:
-        (message,) = loader
+        ((message, _),) = loader
         assert loader.resolved_topics == ["/mine"]
     assert message.data == {"header": header, "blob": b"abc"}

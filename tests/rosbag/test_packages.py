@@ -95,7 +95,7 @@ def test_package_types_have_the_hashes_of_ros1(name: str, digest: str) -> None:
 def test_package_type_is_used_with_finding(tmp_path: Path, distro: Stores | None) -> None:
     path = recorded(tmp_path / "a.db3", "example_interfaces/msg/String")
     with ROSLoader(path, typestore_or_distro=distro) as loader:
-        assert [message.data for message in loader] == [{"data": "hi"}]
+        assert [message.data for message, _ in loader] == [{"data": "hi"}]
         (finding,) = [actual for actual in loader.findings if actual.rule == "assumed-definition"]
     assert "the public package example_interfaces are used: example_interfaces/msg/String" in finding.message
     assert finding.help == "if your types have other fields, provide them with custom_msgs"
@@ -105,9 +105,9 @@ def test_package_type_yields_to_recording_and_job(tmp_path: Path) -> None:
     name = "example_interfaces/msg/String"
     embedded = recorded(tmp_path / "a.db3", name, definitions=((name, "string text"),))
     with ROSLoader(embedded) as loader:
-        assert [message.data for message in loader] == [{"text": "hi"}]
+        assert [message.data for message, _ in loader] == [{"text": "hi"}]
     with ROSLoader(recorded(tmp_path / "b.db3", name), custom_types={name: "string mine"}) as loader:
-        assert [message.data for message in loader] == [{"mine": "hi"}]
+        assert [message.data for message, _ in loader] == [{"mine": "hi"}]
         assert not any(actual.rule == "assumed-definition" for actual in loader.findings)
 
 

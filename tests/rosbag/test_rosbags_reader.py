@@ -51,8 +51,8 @@ def write(path: Path, distro: Stores) -> Path:
     return path
 
 
-def key(message: ROSMessage) -> tuple[int, str]:
-    return message.timestamp_ns, message.topic
+def key(item: tuple[ROSMessage, Exception | None]) -> tuple[int, str]:
+    return item[0].timestamp_ns, item[0].topic
 
 
 @pytest.mark.parametrize(
@@ -77,7 +77,7 @@ def test_loader_both_readers_return_equal_messages(tmp_path: Path, name: str, di
 def test_rosbags_reader_selected_topic_yields_only_its_messages(tmp_path: Path) -> None:
     path = write(tmp_path / "a.mcap", Stores.ROS2_HUMBLE)
     with ROSLoader(path, topics="/string", reader="rosbags") as loader:
-        assert {message.topic for message in loader} == {"/string"}
+        assert {message.topic for message, _ in loader} == {"/string"}
 
 
 def test_rosbags_reader_damaged_file_raises(tmp_path: Path) -> None:
@@ -100,5 +100,5 @@ def test_rosbags_reader_invalid_payload_is_rejected(tmp_path: Path) -> None:
         connection = writer.add_connection("/text", definition)
         writer.write(connection, 1, np.frombuffer(b"\0\1\0\0\xff\0\0\0abc", np.uint8).tobytes())
     with ROSLoader(path, error_policy="ignore", reader="rosbags") as loader:
-        assert list(loader) == []
+        assert all(error is not None for _, error in loader)
         assert loader.rejected == {"/text": 1}

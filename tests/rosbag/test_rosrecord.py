@@ -120,7 +120,7 @@ def test_rosrecord_uses_definition_of_recording(tmp_path: Path) -> None:
         + message("/same_type", "robot_msgs/Old", 10**18, stamped)
     )
     with ROSLoader(path) as loader:
-        first, second = loader
+        (first, _), (second, _) = loader
     stamp = {"sec": 1, "nanosec": 2}
     assert first.data == {"header": {"seq": 5, "stamp": stamp, "frame_id": "map"}, "x": 0.5}
     assert second.data == first.data

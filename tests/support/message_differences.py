@@ -15,8 +15,9 @@ def messages_of(path: Path, **options: Any) -> dict[str, list[tuple[int, dict[st
     """Return log time and content of the messages of each topic; unreadable messages are skipped."""
     messages_by_topic: dict[str, list[tuple[int, dict[str, Any]]]] = defaultdict(list)
     with ROSLoader(path, error_policy="ignore", **options) as loader:
-        for message in loader:
-            messages_by_topic[message.topic].append((message.bag_timestamp_ns, message.data))
+        for message, error in loader:
+            if error is None:
+                messages_by_topic[message.topic].append((message.bag_timestamp_ns, message.data))
     return dict(messages_by_topic)
 
 
