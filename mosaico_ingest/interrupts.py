@@ -77,10 +77,12 @@ class DeferredInterrupt:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        self._restore()
+        self.allow()
 
     def defer(self) -> None:
-        """Start to defer signals."""
+        """Start to defer signals, unless one was deferred already."""
+        if self._handlers or self.asked:
+            return
         if threading.current_thread() is threading.main_thread():
             for number in _SIGNALS:
                 if callable(signal.getsignal(number)):
@@ -88,8 +90,9 @@ class DeferredInterrupt:
 
     def _note(self, _signal: int, _frame: FrameType | None) -> None:
         self.asked = True
-        self._restore()
+        self.allow()
 
-    def _restore(self) -> None:
+    def allow(self) -> None:
+        """Let signals through."""
         while self._handlers:
             signal.signal(*self._handlers.popitem())

@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Generator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rich.console import Console, Group, RenderableType
@@ -17,7 +16,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal
 from mosaico_ingest.cli.logs import json_line
-from mosaico_ingest.errors import IngestError
+from mosaico_ingest.executors.groups import source_bytes
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.events import (
     BatchObserver,
@@ -35,7 +34,6 @@ from mosaico_ingest.report.units import bytes_text, count_text, counted, percent
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
-    from mosaico_ingest.remote import AnyPath
 
 LINE_INTERVAL_S = 5.0
 """Seconds between two lines about the progress of the run."""
@@ -193,17 +191,8 @@ def recording_sizes(jobs: Sequence[Job]) -> list[int]:
     """Return the size of each recording in bytes, or 1 for each if a size is unknown."""
     sizes: list[int] = []
     if len(jobs) <= MAX_SIZED_RECORDINGS:
-        with suppress(OSError, IngestError, ValueError):
-            sizes.extend(max(1, sum(map(_size, job.paths))) for job in jobs)
+        sizes.extend(max(1, size) for size in map(source_bytes, jobs) if size is not None)
     return sizes if len(sizes) == len(jobs) else [1] * len(jobs)
-
-
-def _size(path: AnyPath) -> int:
-    if isinstance(path, Path):
-        return sum(_size(part) for part in path.iterdir()) if path.is_dir() else path.stat().st_size
-    if path.listed is None:
-        raise ValueError("the size is unknown, and a request for each recording takes too long")
-    return path.listed.st_size
 
 
 def headline(tally: Tally) -> str:

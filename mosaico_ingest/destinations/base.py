@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -95,6 +95,8 @@ class Destination(ABC):
     """True if its sessions are `AttachableSession`s, which store files of the sequence."""
     can_amend: ClassVar[bool] = False
     """True if its sinks accept `amendable=True` and then open an `AmendableSession`."""
+    max_commits: int = 1
+    """Maximum number of sessions that are written before `commit` commits them together."""
     replaces_atomically: ClassVar[bool] = True
     """True if `replace` keeps the old sequence until the new one is committed."""
 
@@ -127,9 +129,21 @@ class Destination(ABC):
     def open_sink(self, *, buffer_bytes: int) -> Sink:
         """Return the sink for this destination; one session buffers at most about `buffer_bytes`.
 
+        A session that ends normally is committed, at the latest by `commit`.
+
         Raises:
             SinkError: The destination cannot be opened.
         """
+
+    def commit(self, sessions: Sequence[Session]) -> list[Exception | None]:
+        """Commit sessions of `open_sink` that ended normally; return the error of each session, or None.
+
+        This default is for sinks that commit a session when it ends.
+        """
+        return [None] * len(sessions)
+
+    def discard(self, sessions: Sequence[Session]) -> None:  # noqa: B027 - nothing to do for the same sinks
+        """Discard sessions of `open_sink` that ended normally and are not committed."""
 
     def preflight(self, sequence: str, on_error: SessionLevelErrorPolicy) -> tuple[Finding, ...]:  # noqa: ARG002 - for subclasses
         """Return warnings about a run, for example if it could not follow its session error policy; may connect."""

@@ -10,7 +10,7 @@ from mosaico_ingest.report.events import RunStatus
 
 if TYPE_CHECKING:
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.report.events import BatchObserver
+    from mosaico_ingest.report.events import BatchObserver, Event
     from mosaico_ingest.report.model import Report
 
 
@@ -32,18 +32,23 @@ class InProcess:
     def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task; see `Executor.map`."""
         from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - choosing an executor must not load it
-        from mosaico_ingest.pipeline.run import run_recording  # noqa: PLC0415 - choosing an executor must not load the pipeline
+        from mosaico_ingest.executors.groups import commit_groups  # noqa: PLC0415 - the same
+        from mosaico_ingest.pipeline.run import run_group  # noqa: PLC0415 - choosing an executor must not load the pipeline
 
+        finished = 0
         with keep_destinations_open() as keep_open:
-            previous: Task | None = None
-            for position, task in enumerate(tasks):
-                if previous is not None:
-                    keep_open(previous.job.destination)
-                report = run_recording(task, partial(observe, position)).report
-                yield report
-                if report.status is RunStatus.INTERRUPTED:
+            for destination, tasks_of_group in commit_groups(tasks):
+                if finished:
+                    keep_open(destination)
+                outcomes = run_group(tasks_of_group, partial(_observe_from, finished, observe))
+                yield from (outcome.report for outcome in outcomes)
+                if any(outcome.report.status is RunStatus.INTERRUPTED for outcome in outcomes):
                     return
-                previous = previous if task.known else task
+                finished += len(outcomes)
+
+
+def _observe_from(start: int, observe: BatchObserver, position: int, event: Event) -> None:
+    observe(start + position, event)
 
 
 def do_nothing() -> None:

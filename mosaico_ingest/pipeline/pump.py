@@ -45,17 +45,16 @@ _SHOWN_FIELDS = 8
 
 
 class Written(Struct, frozen=True):
-    """The result of a committed session."""
+    """The result of a session that ended; `verify` checks it once the session is committed."""
 
+    session: Session
     topics: tuple[TopicPipeline, ...]
-    stored: tuple[StoredTopic, ...]
-    """The topics as the destination reports them after the commit."""
+    quarantine: Quarantine | None
+    if_exists: IfExists
     missing: tuple[str, ...] = ()
     """One line per topic with messages that the index promises and that were neither read nor unreadable."""
     failure: BaseException | None = None
     """The error after which the session policy kept the rows accepted so far."""
-    interrupted: bool = False
-    """True if a signal arrived during the commit, which was finished first."""
 
 
 def write_sequence(
@@ -66,8 +65,11 @@ def write_sequence(
     *,
     observe: Observer,
     stopwatch: Stopwatch,
+    interrupt: DeferredInterrupt,
 ) -> Written:
-    """Pump every message of the plan into the sink and commit, or discard as the session policy demands.
+    """Pump every message of the plan into the sink and end the session, or discard it as the session policy demands.
+
+    Signals are deferred from the end of the reading on.
 
     `CommitStarted` precedes every commit: an observer that raises, such as that of a worker whose parent process is gone,
     discards the session.
@@ -81,7 +83,7 @@ def write_sequence(
     quarantine = _open_quarantine(plan, request)
     buffer = WriteBuffer(max_bytes=plan.memory.queue_bytes)
     try:
-        with DeferredInterrupt() as interrupt, _open_session(plan, request, sink) as session:
+        with _open_session(plan, request, sink) as session:
             topics = _open_topics(
                 plan, recording, session, observe, quarantine=quarantine, stopwatch=stopwatch
             )
@@ -114,20 +116,27 @@ def write_sequence(
         if cause is error:
             raise
         raise cause from error
-    if quarantine is not None:
-        _report_quarantine(quarantine, request.if_exists, observe)
-    return Written(topics, session.stored(), tuple(missing), failure, interrupt.asked)
+    return Written(session, topics, quarantine, request.if_exists, tuple(missing), failure)
 
 
-def verify(written: Written, observe: Observer) -> None:
+def verify(written: Written, commit_error: Exception | None, observe: Observer, *, interrupted: bool) -> None:
     """Close every topic in the report and compare the destination with the rows that were written.
 
+    `interrupted` is true if a signal arrived during the commit, which was finished first.
+
     Raises:
+        Exception: `commit_error`, or the earlier error after which a partial result should have been kept.
         IngestError: The error after which a partial result was kept.
         VerificationError: The destination does not have the rows that were written, or messages are missing.
         Interrupted: A signal arrived during the commit.
     """
-    stored = {topic.topic: topic for topic in written.stored}
+    if commit_error is not None:
+        cause = written.failure or commit_error
+        _discard(written.topics, written.quarantine, cause, observe)
+        raise cause from commit_error
+    if written.quarantine is not None:
+        _report_quarantine(written.quarantine, written.if_exists, observe)
+    stored = {topic.topic: topic for topic in written.session.stored()}
     problems = list(written.missing)
     for topic in written.topics:
         content = stored.get(topic.plan.target)
@@ -158,7 +167,7 @@ def verify(written: Written, observe: Observer) -> None:
             "; ".join(problems),
             hint="the stored sequence is incomplete; replace it, and report this as a bug",
         )
-    if written.interrupted:
+    if interrupted:
         raise Interrupted("stopped after the recording was stored completely")
 
 

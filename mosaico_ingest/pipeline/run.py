@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator
+import time
+from collections.abc import Generator, Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from functools import partial
 
 from msgspec import Struct
 
@@ -12,6 +15,7 @@ from mosaico_ingest.destinations.base import Sink
 from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import ContractError, IngestError, Interrupted
 from mosaico_ingest.findings import Finding
+from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
 from mosaico_ingest.pipeline.fingerprint import fingerprint, is_fingerprinted
@@ -19,12 +23,13 @@ from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import check_provenance
-from mosaico_ingest.pipeline.pump import verify, write_sequence
+from mosaico_ingest.pipeline.pump import Written, verify, write_sequence
 from mosaico_ingest.pipeline.rejection_log import RejectionLog
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
+    BatchObserver,
     Event,
     Expected,
     Noted,
@@ -56,46 +61,140 @@ class Outcome(Struct, frozen=True):
 
 
 def run_recording(task: Task, observe: Observer = ignore_events) -> Outcome:
-    """Ingest one recording, or plan it if the task is a dry run; every error, expected or not, is part of the outcome.
+    """Ingest or plan one recording; see `run_group`."""
+    (outcome,) = run_group([task], lambda _position, event: observe(event))
+    return outcome
 
-    Only errors of the observer are raised.
+
+def run_group(tasks: Iterable[Task], observe: BatchObserver) -> list[Outcome]:
+    """Ingest recordings one after the other and commit them together, or plan those whose task is a dry run.
+
+    All tasks have the same target. Every error, expected or not, is part of the outcome of its recording. An interrupt
+    ends the group: its later recordings do not start and have no outcome.
+
+    Only errors of the observer are raised; sessions that are not committed are then discarded.
     """
-    job = task.job
-    events = _RunEvents(task, observe)
-    is_written = False
+    runs: list[_Run] = []
+    with DeferredInterrupt() as interrupt:
+        try:
+            for position, task in enumerate(tasks):
+                if interrupt.asked:
+                    break
+                run = _Run(task, partial(observe, position))
+                runs.append(run)
+                run.write(interrupt)
+                if run.is_interrupted:
+                    break
+                if any(each.written for each in runs):
+                    interrupt.defer()  # a signal between two recordings waits for the commit
+            _commit(runs)
+        except BaseException:
+            _discard(runs)
+            raise
+    last = next((run for run in reversed(runs) if run.written is not None), None)
+    return [run.finish(interrupted=interrupt.asked and run is last) for run in runs]
+
+
+class _Run:
+    """The run of one recording in two steps: `write` until its session ends, and `finish` after the commit."""
+
+    def __init__(self, task: Task, observe: Observer) -> None:
+        self.task = task
+        self.written: Written | None = None
+        """The session to commit; None if there is none."""
+        self.commit_error: Exception | None = None
+        self.commit_s = 0.0
+        """The share of this run in the time of the commit."""
+        self._events = _RunEvents(task, observe)
+        self._outcome: Outcome | None = None
+
+    @property
+    def is_interrupted(self) -> bool:
+        """Whether a signal ended the reading."""
+        error = self._outcome.error if self._outcome else self.written and self.written.failure
+        return isinstance(error, Interrupted)
+
+    def write(self, interrupt: DeferredInterrupt) -> None:
+        """Run the task up to the end of its session."""
+        with self._errors_reported():
+            interrupt.allow()
+            self.written = _ingest(self.task, self._events, interrupt)
+            if self.written is None:
+                self._outcome = self._events.skip()
+        self._events.stopwatch.pause()
+
+    def finish(self, *, interrupted: bool) -> Outcome:
+        """Check what was committed, and return the outcome."""
+        self._events.stopwatch.resume(self.commit_s)
+        if self.written is not None:
+            with self._errors_reported(), log_level(self.task.job.run.log_level):
+                verify(self.written, self.commit_error, self._events, interrupted=interrupted)
+                self._outcome = self._events.complete()
+        assert self._outcome is not None  # noqa: S101 - both steps report every error
+        return self._outcome
+
+    @contextmanager
+    def _errors_reported(self) -> Generator[None]:
+        """Turn every error inside into the outcome of the run."""
+        job, events = self.task.job, self._events
+        try:
+            yield
+        except IngestError as error:
+            self._outcome = events.fail(error)
+        except KeyboardInterrupt:
+            where = str(job.paths[0])
+            self._outcome = events.fail(Interrupted("stopped before any message was read", where=where))
+        except Exception as error:  # noqa: BLE001 - one recording must not end the run of the others
+            _log.debug("unexpected", exc_info=True)
+            self._outcome = events.fail(_unexpected(job, error))
+
+
+def _commit(runs: Sequence[_Run]) -> None:
+    """Commit the sessions of the runs together."""
+    written = [(run, run.written.session) for run in runs if run.written is not None]
+    if not written:
+        return
+    start_s = time.perf_counter()
+    destination = destination_of(runs[0].task.job.destination)
+    sessions = [session for _, session in written]
     try:
-        is_written = _ingest(task, events)
-    except IngestError as error:
-        return events.fail(error)
-    except KeyboardInterrupt:
-        return events.fail(Interrupted("stopped before any message was read", where=str(job.paths[0])))
-    except Exception as error:  # noqa: BLE001 - one recording must not end the run of the others
-        _log.debug("unexpected", exc_info=True)
-        return events.fail(_unexpected(job, error))
-    return events.complete() if is_written else events.skip()
+        errors = destination.commit(sessions)
+    except KeyboardInterrupt:  # the second signal, since the first one is deferred
+        destination.discard(sessions)
+        errors = [Interrupted("stopped during the commit", hint="run the same command again")] * len(sessions)
+    elapsed_s = time.perf_counter() - start_s
+    for (run, _), error in zip(written, errors, strict=True):
+        run.commit_error, run.commit_s = error, elapsed_s / len(written)
 
 
-def _ingest(task: Task, events: _RunEvents) -> bool:
-    """Run a task; return False if there is nothing to write."""
+def _discard(runs: Sequence[_Run]) -> None:
+    """Discard the sessions of the runs, unless they are committed."""
+    sessions = [run.written.session for run in runs if run.written is not None]
+    if sessions:
+        destination_of(runs[0].task.job.destination).discard(sessions)
+
+
+def _ingest(task: Task, events: _RunEvents, interrupt: DeferredInterrupt) -> Written | None:
+    """Run a task up to the end of its session; return None if there is nothing to write."""
     job = task.job
     if task.known:
         events.start_unopened()
-        return False
+        return None
     before = None if task.dry_run else fingerprint(job)
     with log_level(job.run.log_level), open_job(job) as (recording, resolver):
         plan = _plan(task, recording, resolver)
         events.start(plan)
         if task.dry_run:
-            return False
+            return None
         _check_group(plan)
         request = check_provenance(plan, before if is_fingerprinted(job, plan.files) else None)
         if request is None:
-            return False
+            return None
         sink = _open_sink(plan, events)
         events.stopwatch.lap(Step.PREPARE)
-        written = write_sequence(plan, request, recording, sink, observe=events, stopwatch=events.stopwatch)
-        verify(written, events)
-    return True
+        return write_sequence(
+            plan, request, recording, sink, observe=events, stopwatch=events.stopwatch, interrupt=interrupt
+        )
 
 
 def _check_group(plan: Plan) -> None:

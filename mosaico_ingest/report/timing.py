@@ -196,7 +196,7 @@ class Stopwatch:
 
     def __init__(self) -> None:
         self.began_at = datetime.now(timezone.utc)
-        self._began = self._last = time.perf_counter()
+        self._began = self._last = self._paused = time.perf_counter()
         self._seconds = dict.fromkeys(Step, 0.0)
 
     @property
@@ -214,6 +214,16 @@ class Stopwatch:
         now = time.perf_counter()
         self._seconds[step] += now - self._last
         self._last = now
+
+    def pause(self) -> None:
+        """Stop assigning time until `resume`."""
+        self._paused = time.perf_counter()
+
+    def resume(self, seconds: float) -> None:
+        """Continue after a pause, of which the given seconds count as elapsed."""
+        pause = time.perf_counter() - self._paused - seconds
+        self._began += pause
+        self._last += pause
 
     def add(self, step: Step, seconds: float) -> None:
         """Add time that another thread measured to a step."""

@@ -7,7 +7,7 @@ import shutil
 import signal
 import threading
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from multiprocessing.reduction import ForkingPickler
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ import pytest
 
 from mosaico_ingest.adapters.python import ROSAdapterBase
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.destination import StoreDestination
 from mosaico_ingest.destinations.store.session import StoreSession
 from mosaico_ingest.executors.base import Executor, InProcess, do_nothing
 from mosaico_ingest.executors.processes import Processes, _spawn_worker
@@ -67,19 +68,23 @@ class KillerAfterCommit(Killer):
 
     @classmethod
     def from_dict(cls, ros_data: dict[str, Any]) -> IMU:  # noqa: ARG003 - the base class's signature
-        StoreSession.commit = _commit_and_die_once  # type: ignore[method-assign] - only in the worker's process
+        StoreDestination.commit = _commit_and_die_once  # type: ignore[method-assign] - only in the worker's process
         return IMU(acceleration=_STILL, angular_velocity=_STILL)
 
 
-_COMMIT = StoreSession.commit
+_COMMIT = StoreDestination.commit
 
 
-def _commit_and_die_once(session: StoreSession) -> None:
-    _COMMIT(session)
-    happened = Path(os.environ["KILLED_ONCE"]) / session._claim.sequence
-    if not happened.exists():
-        happened.touch()
+def _commit_and_die_once(
+    destination: StoreDestination, sessions: Sequence[StoreSession]
+) -> list[Exception | None]:
+    errors = _COMMIT(destination, sessions)
+    happened = [Path(os.environ["KILLED_ONCE"]) / session.closed.claim.sequence for session in sessions]
+    if not all(path.exists() for path in happened):
+        for path in happened:
+            path.touch()
         os.kill(os.getpid(), signal.SIGKILL)
+    return errors
 
 
 class Refusing(ROSAdapterBase[IMU]):

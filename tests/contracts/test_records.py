@@ -71,7 +71,7 @@ def commit(
 ) -> tuple[str, list[str]]:
     session = new_session_id()
     claim = records.claim(session, sequence, if_exists, is_live=alive)
-    return session, records.commit(claim, written(session, *topics, start_ns=start_ns))
+    return session, records.commit([(claim, written(session, *topics, start_ns=start_ns))])
 
 
 def test_committed_sequence_is_read_back_equal(store: Store, records: StoreCatalog) -> None:
@@ -122,9 +122,9 @@ def test_claim_of_dead_writer_does_not_block(records: StoreCatalog) -> None:
     claim = records.claim(first, "s", IfExists.FAIL, is_live=alive)
     second = new_session_id()
     other = records.claim(second, "s", IfExists.FAIL, is_live=dead)
-    records.commit(other, written(second, ("/a", POINT)))
+    records.commit([(other, written(second, ("/a", POINT)))])
     with pytest.raises(SinkError):
-        records.commit(claim, written(first, ("/b", POINT)))
+        records.commit([(claim, written(first, ("/b", POINT)))])
     info = records.sequence("s")
     assert info is not None
     assert [topic.name for topic in info.topics] == ["/a"]
@@ -146,7 +146,7 @@ def test_two_writers_can_append_concurrently(records: StoreCatalog) -> None:
     sessions = [new_session_id() for _ in range(2)]
     claims = [records.claim(one, "s", IfExists.APPEND, is_live=alive) for one in sessions]
     for session, claim in zip(sessions, claims, strict=True):
-        records.commit(claim, written(session, ("/a", POINT)))
+        records.commit([(claim, written(session, ("/a", POINT)))])
     info = records.sequence("s")
     assert info is not None
     assert len(info.topics[0].segments) == 3
@@ -177,11 +177,11 @@ def test_replace_fails_if_the_sequence_changed_meanwhile(records: StoreCatalog) 
     claim = records.claim(session, "s", IfExists.REPLACE, is_live=alive)
     others = records.claim(appended := new_session_id(), "s", IfExists.APPEND, is_live=dead)
     try:
-        records.commit(others, written(appended, ("/a", POINT)))
+        records.commit([(others, written(appended, ("/a", POINT)))])
     except SinkError:
         return  # the claim alone keeps others away
     with pytest.raises(SinkError, match="changed the sequence"):
-        records.commit(claim, written(session, ("/c", FLAG)))
+        records.commit([(claim, written(session, ("/c", FLAG)))])
 
 
 def test_notes_are_added_and_deleted(records: StoreCatalog) -> None:

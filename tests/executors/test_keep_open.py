@@ -25,7 +25,13 @@ def task(folder: Path, name: str) -> Task:
     return Task(config.job)
 
 
-def test_in_process_executor_keeps_catalog_open_between_recordings(tmp_path: Path) -> None:
+@pytest.fixture
+def groups_of_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mosaico_ingest.destinations.store.destination._MAX_COMMITS", 1)
+
+
+@pytest.mark.usefixtures("groups_of_one")
+def test_in_process_executor_keeps_catalog_open_between_groups(tmp_path: Path) -> None:
     log = tmp_path / "store/catalog.sqlite-wal"
     there = [log.exists() for _ in InProcess().map([task(tmp_path, name) for name in "abc"], lambda *_: None)]
     assert there == [False, True, True]
@@ -53,6 +59,7 @@ def test_keep_open_without_store_creates_nothing(tmp_path: Path) -> None:
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.usefixtures("groups_of_one")
 def test_batch_opens_few_connections_to_catalog(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     paths: list[Path] = []
 

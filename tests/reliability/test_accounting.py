@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from itertools import count
@@ -21,9 +21,9 @@ from store_formats import make_format_1
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.destinations.base import StoredTopic, TopicWriter
+from mosaico_ingest.destinations.base import Session, StoredTopic, TopicWriter
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.destinations.store.session import StoreSession
+from mosaico_ingest.destinations.store.destination import StoreDestination
 from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import BagError, VerificationError
 from mosaico_ingest.job.config import ROSInjectionConfig
@@ -277,29 +277,35 @@ def test_run_into_catalog_without_checksums_adds_the_column(
 
 
 def interrupt_commits(monkeypatch: pytest.MonkeyPatch, *, signals: int) -> None:
-    commit = StoreSession.commit
+    commit = StoreDestination.commit
 
-    def interrupted(session: StoreSession) -> None:
+    def interrupted(destination: StoreDestination, sessions: Sequence[Session]) -> list[Exception | None]:
         for _ in range(signals):
             signal.raise_signal(signal.SIGINT)
-        commit(session)
+        return commit(destination, sessions)
 
-    monkeypatch.setattr(StoreSession, "commit", interrupted)
+    monkeypatch.setattr(StoreDestination, "commit", interrupted)
 
 
 @pytest.mark.usefixtures("interruptible")
 @pytest.mark.parametrize("signals", [1, 2])
+@pytest.mark.parametrize("group", [1, 2])
 def test_run_interrupted_during_commit_finishes_it_unless_interrupted_twice(
-    signals: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    signals: int, group: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     interrupt_commits(monkeypatch, signals=signals)
-    configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("drive", "next")]
-    (report,) = api.run(configs).recordings
-    assert (report.status, report.exit_code) == (RunStatus.INTERRUPTED, 130)
-    kept = report.totals.written if signals == 1 else 0
-    assert sum(sequence.rows for sequence in Store.open(tmp_path / "store").sequences()) == kept
-    assert report.totals.read == report.totals.written + report.totals.rejected
-    assert (report.totals.rejected == 0) is (signals == 1)
+    monkeypatch.setattr("mosaico_ingest.destinations.store.destination._MAX_COMMITS", group)
+    monkeypatch.setattr("mosaico_ingest.executors.groups._MAX_S", 60.0)
+    configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("a", "b", "c")]
+    reports = api.run(configs).recordings
+    earlier = RunStatus.COMPLETED if signals == 1 else RunStatus.INTERRUPTED
+    assert [report.status for report in reports] == [*[earlier] * (group - 1), RunStatus.INTERRUPTED]
+    assert reports[-1].exit_code == 130
+    sequences = Store.open(tmp_path / "store").sequences()
+    assert sum(info.rows for info in sequences) == sum(report.totals.written for report in reports)
+    for report in reports:
+        assert report.totals.read == report.totals.written + report.totals.rejected
+        assert (report.totals.rejected == 0) is (signals == 1)
     assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
 
 

@@ -22,10 +22,11 @@ from .conftest import CUT, RunJob, WriteBag, number
 
 WriteJob = Callable[..., Path]
 WRONG = "float64 data\nfloat64 more"
+_STORE = "mosaico_ingest.destinations.store.destination"
 MOMENTS = {
-    "before the commit": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "before"),
+    "before the commit": (f"{_STORE}.StoreDestination", "commit", "before"),
     "segments moved, not entered": ("mosaico_ingest.destinations.store.files.LocalFiles", "publish", "after"),
-    "committed": ("mosaico_ingest.destinations.store.session.StoreSession", "commit", "after"),
+    "committed": (f"{_STORE}.StoreDestination", "commit", "after"),
     "committed and checked": ("mosaico_ingest.destinations.store.session.StoreSession", "stored", "after"),
     "before it is marked": ("mosaico_ingest.pipeline.quarantine.QuarantineFile", "mark_replayed", "before"),
     "messages renamed, their index not": ("pathlib.Path", "rename", "after"),

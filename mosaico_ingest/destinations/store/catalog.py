@@ -12,7 +12,7 @@ import secrets
 import sqlite3
 import time
 from collections import defaultdict
-from collections.abc import Callable, Collection, Generator, Mapping
+from collections.abc import Callable, Collection, Generator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from functools import partial
 from pathlib import Path
@@ -164,10 +164,10 @@ class Catalog:
         with self.write(lasting=False) as db:
             return _claim(db, session, sequence, if_exists, is_live=is_live)
 
-    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
+    def commit(self, sessions: Sequence[tuple[Claim, NewSession]]) -> list[str]:
         """See `StoreCatalog.commit`."""
         with self.write() as db:
-            return _commit(db, claimed, new)
+            return [path for claimed, new in sessions for path in _commit(db, claimed, new)]
 
     def replace_segments(self, change: Replacement) -> bool:
         """See `StoreCatalog.replace_segments`; a catalog of an earlier format is converted."""

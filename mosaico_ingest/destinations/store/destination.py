@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Collection
+from collections.abc import Collection, Sequence
 from contextlib import AbstractContextManager, closing
 from os.path import normpath, relpath
 from pathlib import Path
-from typing import ClassVar
+from typing import ClassVar, cast
 
 from mosaico_ingest.destinations.base import (
     Destination,
@@ -17,14 +17,19 @@ from mosaico_ingest.destinations.base import (
     ExistingSession,
     ExistingTopic,
     FamilyTopic,
+    Session,
     Sink,
 )
+from mosaico_ingest.destinations.store.commit import commit_sessions
 from mosaico_ingest.destinations.store.model import SequenceInfo
-from mosaico_ingest.destinations.store.session import StoreSink
+from mosaico_ingest.destinations.store.session import StoreSession, StoreSink
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError, Unreachable
 from mosaico_ingest.job.values import Compression
 from mosaico_ingest.remote import AnyPath, RemotePath
+
+_MAX_COMMITS = 32
+"""Maximum number of sessions in a transaction of the catalog; a store behind a URL has no transactions."""
 
 
 class StoreDestination(Destination):
@@ -37,6 +42,7 @@ class StoreDestination(Destination):
     def __init__(self, path: AnyPath, compression: Compression = Compression.FAST) -> None:
         self.path = path
         self.compression = compression
+        self.max_commits = _MAX_COMMITS if isinstance(path, Path) else 1
 
     def describe(self, *, folder: Path | None = None) -> str:
         """Return the path or URL."""
@@ -79,8 +85,17 @@ class StoreDestination(Destination):
         }
 
     def open_sink(self, *, buffer_bytes: int) -> Sink:
-        """Return a sink, after creating the store if necessary."""
-        return StoreSink(Store.open(self.path), buffer_bytes, self.compression)
+        """Return a sink whose sessions wait for `commit`, after creating the store if necessary."""
+        return StoreSink(Store.open(self.path), buffer_bytes, self.compression, deferred=True)
+
+    def commit(self, sessions: Sequence[Session]) -> list[Exception | None]:
+        """Commit closed sessions in one transaction; see `commit_sessions`."""
+        return commit_sessions(cast("Sequence[StoreSession]", sessions))
+
+    def discard(self, sessions: Sequence[Session]) -> None:
+        """Discard closed sessions that are not committed."""
+        for session in cast("Sequence[StoreSession]", sessions):
+            session.discard()
 
     def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
         """Return the topics with these names that sessions of the family created, oldest session first."""

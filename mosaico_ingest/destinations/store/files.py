@@ -33,7 +33,7 @@ import sqlite3
 import threading
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from itertools import takewhile
@@ -117,6 +117,10 @@ ATTACHMENTS = "attachments"
 _UNSAFE = re.compile(rb"[^A-Za-z0-9_-]")
 _LONGEST = 200
 _ATTEMPTS = 5
+_FAST_S = 0.005
+"""Seconds of waiting for the disk after which several threads wait."""
+_THREADS = 8
+"""Number of threads that wait for the disk or for requests."""
 _CROCKFORD = "0123456789ABCDEFGHJKMNPQRSTVWXYZ"
 
 
@@ -195,15 +199,23 @@ class LocalFiles(Struct, frozen=True):
             for folder, _, files in os.walk(top):
                 yield from (Path(folder, name) for name in files)
 
+    def sync(self, paths: Sequence[AnyPath]) -> None:
+        """Wait until files or folders are on the disk: on this thread, and on several once the disk turns out to be slow."""
+        start_s = time.monotonic()
+        for done, path in enumerate(paths):
+            if time.monotonic() - start_s > _FAST_S:
+                with ThreadPoolExecutor(_THREADS, thread_name_prefix="fsync") as pool:
+                    list(pool.map(sync, paths[done:]))
+                return
+            sync(path)
+
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their final paths, so that they survive a power cut."""
-        changed: set[Path] = set()
+        """Move synced files to their final paths, so that they survive a power cut; files that were moved are skipped."""
+        folders: dict[AnyPath, None] = {}
         for staged, target in ((Path(str(old)), Path(str(new))) for old, new in moves.items()):
-            changed.add(target.parent)
-            changed.update(folder.parent for folder in takewhile(_is_missing, target.parents))
             _move(staged, target)
-        for folder in changed:
-            fsync(folder)
+            folders |= dict.fromkeys(takewhile(lambda folder: folder != self.root, target.parents))
+        self.sync([*folders, self.root])
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
         """Remove segments and empty folders; garbage collection retries failed removals."""
@@ -239,16 +251,14 @@ def encoded(part: str) -> str:
     return f"{safe[:_LONGEST]}%{hashlib.sha256(part.encode()).hexdigest()[:16]}"
 
 
-def _is_missing(folder: Path) -> bool:
-    return not folder.exists()
-
-
 def _move(staged: Path, target: Path) -> None:
     for attempts_left in reversed(range(_ATTEMPTS)):
         target.parent.mkdir(parents=True, exist_ok=True)
         try:
             staged.rename(target)
         except FileNotFoundError:  # a concurrent deletion may remove the empty folder
+            if not staged.exists() and target.exists():
+                return  # an earlier attempt moved the file
             if not attempts_left or not staged.exists():
                 raise
         else:
@@ -279,7 +289,6 @@ _SILENT_S = 180.0
 """Time without a heartbeat after which a writer is considered dead."""
 _LAST_BEAT_S = 5.0
 """Time limit for a heartbeat that is in progress at the end of a session."""
-_THREADS = 8
 _COPY_BYTES = 8 << 20
 
 
@@ -339,6 +348,9 @@ class ObjectFiles:
     def in_use(self, session: str, grace_s: float) -> bool:  # noqa: ARG002 - the heartbeat starts before the first file
         """Return whether the session's writer is alive."""
         return self.is_live(session)
+
+    def sync(self, paths: Sequence[AnyPath]) -> None:
+        """Return immediately, since closed files are stored."""
 
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
         """Mark finished files as published; copy those whose final path has changed since they were written."""

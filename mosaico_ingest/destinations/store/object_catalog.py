@@ -12,7 +12,7 @@ import json
 import random
 import time
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Collection, Generator, Iterable, Iterator
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
@@ -354,8 +354,11 @@ class ObjectCatalog:
         types = document.types if if_exists is IfExists.APPEND else {}
         return Claim(sequence, if_exists, document.created_ns, document.session_ids, types)
 
-    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
-        """See `StoreCatalog.commit`."""
+    def commit(self, sessions: Sequence[tuple[Claim, NewSession]]) -> list[str]:
+        """See `StoreCatalog.commit`; a document is a transaction of its own."""
+        return [path for claimed, new in sessions for path in self._commit(claimed, new)]
+
+    def _commit(self, claimed: Claim, new: NewSession) -> list[str]:
         if claimed.if_exists is IfExists.APPEND:
             with self._holding(claimed.sequence, session=new.id):
                 return self._enter(claimed, new)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Protocol
 
 from mosaico_ingest.destinations.base import FamilyTopic
@@ -75,8 +75,12 @@ class Files(Protocol):
         """Return whether the session's writer is alive or may be about to start."""
         ...
 
+    def sync(self, paths: Sequence[AnyPath]) -> None:
+        """Wait until closed files are on the disk."""
+        ...
+
     def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
-        """Move finished files to their final paths, so that they survive a power cut."""
+        """Move synced files to their final paths, so that they survive a power cut; files that were moved are skipped."""
         ...
 
     def remove(self, paths: Iterable[AnyPath]) -> None:
@@ -120,8 +124,11 @@ class StoreCatalog(Protocol):
         """
         ...
 
-    def commit(self, claimed: Claim, new: NewSession) -> list[str]:
-        """Add a session and return the paths of the segments it replaces."""
+    def commit(self, sessions: Sequence[tuple[Claim, NewSession]]) -> list[str]:
+        """Add sessions and return the paths of the segments they replace.
+
+        A catalog with transactions adds all of them, or none if one cannot be added. Others commit one session at a time.
+        """
         ...
 
     def replace_segments(self, change: Replacement) -> bool:

@@ -29,6 +29,7 @@ from mosaico_ingest.destinations.base import (
 )
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.destinations.store.checksum import combined
+from mosaico_ingest.destinations.store.commit import Closed, commit_sessions
 from mosaico_ingest.destinations.store.errors import translate_errors
 from mosaico_ingest.destinations.store.files import new_session_id
 from mosaico_ingest.destinations.store.group_writers import Group, GroupWriters
@@ -170,11 +171,16 @@ class StoreTopic:
             self._flush()
             self._finish_segment()
 
+    @property
+    def unsynced(self) -> tuple[AnyPath, ...]:
+        """The finished segments that may not be on the disk yet."""
+        return tuple(segment.path for segment in self.segments[self._synced :])
+
     def sync(self) -> None:
         """Wait until the finished segments are on the disk."""
-        for segment in self.segments[self._synced :]:
+        for path in self.unsynced:
             with translate_errors(self._staging.where):
-                files.sync(segment.path)
+                files.sync(path)
             self._synced += 1
 
     def abandon(self) -> None:
@@ -244,8 +250,6 @@ class StoreTopic:
 
 _WORTH_A_THREAD_BYTES = 1 << 18
 """Minimum size of a topic that is closed on a thread of its own; behind a URL, every topic is."""
-_FAST_S = 0.005
-_THREADS = 8
 _WAITING = 2
 """Number of additional threads, since threads that wait for the disk do not use a core."""
 
@@ -267,7 +271,7 @@ def _file_name(name: str) -> str:
 
 
 class StoreSession:
-    """One writing session; `commit` or `discard` ends it."""
+    """One writing session: `close` finishes its files, then `commit_sessions` or `discard` ends it."""
 
     def __init__(
         self,
@@ -284,12 +288,13 @@ class StoreSession:
     ) -> None:
         self.id = new_session_id()
         self.created_ns = time.time_ns()
-        self._layout = layout
-        self._catalog = catalog
+        self.layout = layout
+        self.catalog = catalog
         self._metadata = metadata
         self._topics: dict[str, StoreTopic] = {}
         self._notes: list[NewNote] = []
         self._attachments: list[_Attachment] = []
+        self._closed: Closed | None = None
         self._staging = Staging(
             layout.root,
             partial(layout.staged, self.id, sequence),
@@ -304,7 +309,7 @@ class StoreSession:
                 self._open_catalog.enter_context(closing(catalog.keep_open()))
             self._claim = catalog.claim(self.id, sequence, if_exists, is_live=layout.is_live)
         except BaseException:
-            self._leave()
+            self.leave()
             raise
 
     def topic(self, name: str, ontology: OntologyType, metadata: Mapping[str, Any]) -> StoreTopic:
@@ -317,7 +322,7 @@ class StoreSession:
         if existing is not None:
             check_same_type(existing, ontology, where=name)
         with translate_errors(name):
-            folder = self._layout.topic(self._claim.sequence, path)
+            folder = self.layout.topic(self._claim.sequence, path)
             topic = StoreTopic(self._staging, path, ontology, described, folder=folder)
         self._staging.topics[path] = self._topics[name] = topic
         return topic
@@ -325,7 +330,7 @@ class StoreSession:
     def attach(self, file: Attached, chunks: Iterable[bytes]) -> None:
         """Store a file of the sequence; see `AttachableSession.attach`."""
         name = f"{self.id}-{len(self._attachments):04}-{_file_name(file.name)}"
-        staged = self._layout.staged_attachment(self.id, self._claim.sequence, name)
+        staged = self.layout.staged_attachment(self.id, self._claim.sequence, name)
         digest, size = xxh3_128(), 0
         try:
             with translate_errors(file.name), files.create(staged) as target:
@@ -353,45 +358,53 @@ class StoreSession:
         if sequence is None:
             return
         name = protocol.check_sequence_name(sequence)
-        self._catalog.release(self.id, self._claim.sequence)
-        self._claim = self._catalog.claim(self.id, name, IfExists.REPLACE, is_live=self._layout.is_live)
+        self.catalog.release(self.id, self._claim.sequence)
+        self._claim = self.catalog.claim(self.id, name, IfExists.REPLACE, is_live=self.layout.is_live)
         with translate_errors(name):
             for topic in self._staging.topics.values():
-                topic.folder = self._layout.topic(name, topic.name)
+                topic.folder = self.layout.topic(name, topic.name)
 
     def stored(self) -> tuple[StoredTopic, ...]:
         """Return the content according to the footers of the committed files; see `Session.stored`."""
         return tuple(self._stored(name, topic) for name, topic in self._topics.items())
 
-    def commit(self) -> None:
-        """Finish every topic, move its segments to their final paths, and enter them in the catalog atomically."""
+    def close(self) -> None:
+        """Finish the files of every topic; `commit_sessions` makes them durable and visible."""
         ended_early = any(note.topic is None for note in self._notes)
         if ended_early and self._claim.if_exists is IfExists.REPLACE and self._claim.sequence_id is not None:
             raise replacement_is_incomplete(self._claim.sequence)
         self._close_topics()
+        topics = tuple(self._staging.topics.values())
         moves = {
-            segment.path: topic.folder / segment.path.name
-            for topic in self._staging.topics.values()
-            for segment in topic.segments
+            segment.path: topic.folder / segment.path.name for topic in topics for segment in topic.segments
         }
         moves |= {each.staged: self._final(each) for each in self._attachments}
-        topics = tuple(map(self._placed, self._staging.topics.values()))
         metadata = self._metadata_with_attachments()
-        new = NewSession(self.id, metadata, self.created_ns, topics, tuple(self._notes))
-        replaced_attachments = self._replaced_attachments()
-        try:
-            with translate_errors(self._layout.root):
-                self._layout.publish(moves)
-            replaced = self._catalog.commit(self._claim, new)
-        except BaseException:
-            if not self._may_be_committed():
-                self._layout.remove(moves.values())
-            raise
-        self._leave()
-        self._layout.remove([*(self._layout.root / path for path in replaced), *replaced_attachments])
+        self._closed = Closed(
+            self._claim,
+            NewSession(
+                self.id, metadata, self.created_ns, tuple(map(self._placed, topics)), tuple(self._notes)
+            ),
+            unsynced=tuple(path for topic in topics for path in topic.unsynced),
+            moves=moves,
+            obsolete=self._replaced_attachments(),
+        )
+
+    @property
+    def closed(self) -> Closed:
+        """The content of the session, after `close`."""
+        assert self._closed is not None  # noqa: S101 - callers close the session first
+        return self._closed
+
+    def commit(self) -> None:
+        """Close the session and commit it in a group of its own."""
+        self.close()
+        (error,) = commit_sessions([self])
+        if error is not None:
+            raise error
 
     def _final(self, attachment: _Attachment) -> AnyPath:
-        return self._layout.attachment(self._claim.sequence, attachment.name)
+        return self.layout.attachment(self._claim.sequence, attachment.name)
 
     def _metadata_with_attachments(self) -> str:
         """Return the metadata of the session with the list of its attachments."""
@@ -399,7 +412,7 @@ class StoreSession:
             return self._metadata
         entries = [
             {
-                "path": self._layout.relative(self._final(each)),
+                "path": self.layout.relative(self._final(each)),
                 "name": each.file.name,
                 "media_type": each.file.media_type,
                 "log_ns": each.file.log_ns,
@@ -412,25 +425,24 @@ class StoreSession:
         metadata = {**json.loads(self._metadata), ATTACHMENTS_KEY: entries}
         return protocol.check_metadata(metadata, where=self._claim.sequence)
 
-    def _replaced_attachments(self) -> list[AnyPath]:
+    def _replaced_attachments(self) -> tuple[AnyPath, ...]:
         """Return the attachments of the stored sequence that the commit replaces."""
         if self._claim.if_exists is not IfExists.REPLACE or self._claim.sequence_id is None:
-            return []
-        info = self._catalog.sequence(self._claim.sequence)
-        return [] if info is None else [each.path for each in info.attachments]
+            return ()
+        info = self.catalog.sequence(self._claim.sequence)
+        return () if info is None else tuple(each.path for each in info.attachments)
 
     def _close_topics(self) -> None:
         """Close large topics on threads, and small topics on this thread meanwhile."""
         # the largest topic comes first, so that it does not finish long after the others
         waiting = sorted(self._staging.topics.values(), key=lambda topic: -topic.buffered_bytes)
-        most = 0 if isinstance(self._layout.root, RemotePath) else _WORTH_A_THREAD_BYTES
+        most = 0 if isinstance(self.layout.root, RemotePath) else _WORTH_A_THREAD_BYTES
         large = [topic for topic in waiting if topic.buffered_bytes >= most]
         small = waiting[len(large) :]
         with ThreadPoolExecutor((os.cpu_count() or 1) + _WAITING, thread_name_prefix="segment") as pool:
             closing_large = pool.map(_close_and_sync, large)
             for topic in small:
                 topic.close()
-            _sync(small)
             list(closing_large)
 
     def discard(self) -> None:
@@ -440,11 +452,17 @@ class StoreSession:
         with ThreadPoolExecutor(os.cpu_count(), thread_name_prefix="segment") as pool:
             list(pool.map(StoreTopic.abandon, self._staging.topics.values()))
         try:
-            self._catalog.release(self.id, self._claim.sequence)
+            self.catalog.release(self.id, self._claim.sequence)
         except SinkError:
             return  # the original error is more important, and the claim ends with the lease
         finally:
-            self._leave()
+            self.leave()
+
+    def withdraw(self) -> None:
+        """Discard the session after its files were moved to their final paths."""
+        if not self._may_be_committed():
+            self.layout.remove(self.closed.moves.values())
+        self.discard()
 
     def _may_be_committed(self) -> bool:
         """Return whether the catalog may contain the session although its commit failed, since the response may be lost.
@@ -452,13 +470,13 @@ class StoreSession:
         If the catalog cannot be read, the files are kept: garbage collection removes files that are not needed.
         """
         try:
-            info = self._catalog.sequence(self._claim.sequence)
+            info = self.catalog.sequence(self._claim.sequence)
         except IngestError:
             return True
         return info is not None and any(session.id == self.id for session in info.sessions)
 
     def _placed(self, topic: StoreTopic) -> NewTopic:
-        relative = self._layout.relative(topic.folder)
+        relative = self.layout.relative(topic.folder)
         segments = {f"{relative}/{segment.path.name}": segment for segment in topic.segments}
         return NewTopic(topic.name, topic.ontology, topic.schema, topic.metadata, topic.created_ns, segments)
 
@@ -478,12 +496,13 @@ class StoreSession:
             name, rows, min(times, default=None), max(times, default=None), stored_bytes, checksum
         )
 
-    def _leave(self) -> None:
+    def leave(self) -> None:
+        """Release everything that the session holds; a second call has no effect."""
         if self._staging.writers is not None:
             self._staging.writers.close()
         self._open_catalog.close()
         self._lease.release()
-        self._layout.discard(self.id)
+        self.layout.discard(self.id)
 
 
 def _close_and_sync(topic: StoreTopic) -> None:
@@ -491,26 +510,19 @@ def _close_and_sync(topic: StoreTopic) -> None:
     topic.sync()
 
 
-def _sync(topics: Sequence[StoreTopic]) -> None:
-    """Wait for the disk topic by topic, and on several threads once the disk turns out to be slow."""
-    began = time.monotonic()
-    for done, topic in enumerate(topics):
-        if time.monotonic() - began > _FAST_S:
-            with ThreadPoolExecutor(_THREADS, thread_name_prefix="fsync") as pool:
-                list(pool.map(StoreTopic.sync, topics[done:]))
-            return
-        topic.sync()
-
-
 _BUFFER_BYTES = 96 << 20
 
 
 class StoreSink(Struct, frozen=True):
-    """Writes sequences into a store; one session buffers at most about `buffer_bytes`."""
+    """Writes sequences into a store; one session buffers at most about `buffer_bytes`.
+
+    The normal exit of a session commits it or, if `deferred` is set, only closes it for `commit_sessions`.
+    """
 
     store: Store
     buffer_bytes: int = _BUFFER_BYTES
     compression: Compression = Compression.FAST
+    deferred: bool = False
 
     @contextmanager
     def open(
@@ -535,7 +547,10 @@ class StoreSink(Struct, frozen=True):
         )
         try:
             yield session
-            session.commit()
+            if self.deferred:
+                session.close()
+            else:
+                session.commit()
         except BaseException:
             session.discard()
             raise
