@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from fnmatch import fnmatchcase
 from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
@@ -46,7 +47,9 @@ class ReadTopic(Struct, frozen=True):
     """The name in the recording."""
     connections: tuple[int, ...]
     ontology: OntologyType | None = None
-    """The type of its rows; None if no expectation refers to them."""
+    """The type of its rows; None if no expectation refers to them, and for an adapter with `outputs`."""
+    outputs: tuple[tuple[str, OntologyType], ...] = ()
+    """The name and the type of each output of an adapter with `outputs`, in the order of the adapter's rows."""
 
 
 class Clause(Struct, frozen=True):
@@ -128,6 +131,11 @@ class Contract(Struct, frozen=True):
             pattern = item.topic if isinstance(item, ExpectedTopic) else item
             severity = item.severity if isinstance(item, ExpectedTopic) else None
             yield pattern, self._clause(("expect", key, position), item, severity)
+
+    def lists(self, topic: str) -> bool:
+        """Return whether a pattern of `required` or `forbidden` matches a topic."""
+        patterns = [pattern for key in ("required", "forbidden") for pattern, _ in self.pattern_clauses(key)]
+        return any(fnmatchcase(topic, pattern) for pattern in patterns)
 
     def topic_clauses(self, topic: str) -> dict[str, Clause]:
         """Return the expectations that apply to a topic by key, without those of `fields`."""

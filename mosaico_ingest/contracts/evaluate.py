@@ -34,6 +34,7 @@ class TopicFacts:
         count: int | None,
         monitor: TopicMonitor | None = None,
         unread: str | None = None,
+        is_output: bool = False,
     ) -> None:
         self.name = name
         self.msgtypes = msgtypes
@@ -43,6 +44,8 @@ class TopicFacts:
         """None if the topic was not read."""
         self.unread = unread
         """The reason why the topic was not read."""
+        self.is_output = is_output
+        """Whether the topic is an output of an adapter, whose messages another topic counts."""
 
 
 class Facts:
@@ -73,7 +76,7 @@ class Facts:
     @property
     def count(self) -> int | None:
         """Number of messages of all topics; None if it is unknown."""
-        counts = [topic.count for topic in self.topics.values()]
+        counts = [topic.count for topic in self.topics.values() if not topic.is_output]
         return None if None in counts else sum(count or 0 for count in counts)
 
     def span_of(self, name: str) -> tuple[int, int] | None:

@@ -17,6 +17,7 @@ from mosaico_ingest.contracts.values import Batch
 from mosaico_ingest.job.values import RECORDING, Interval
 
 if TYPE_CHECKING:
+    from mosaico_ingest.adapters.adapter import Adapted
     from mosaico_ingest.contracts.row_monitor import RowMonitor
 
 
@@ -40,6 +41,11 @@ class TopicMonitor:
     """Number of messages of each connection so far."""
     _times: list[Int64s] = field(default_factory=list[Int64s])
 
+    @property
+    def is_observed(self) -> bool:
+        """Whether a block was observed, even if it has no message."""
+        return bool(self._counts)
+
     def add_block(self, connection: int, log_times: Int64s) -> int:
         """Add the log times of a message block, which are sorted; return the position of its first message."""
         position = self._counts[connection]
@@ -60,12 +66,6 @@ class TopicMonitor:
         for rows in self.rows.values():
             rows.finish()
 
-    def observer(
-        self, connection: int, *, start_ns: int | None = None, end_ns: int | None = None
-    ) -> BlockObserver:
-        """Return the observer of the message blocks of a connection, which ignores log times outside the range."""
-        return BlockObserver(self, connection, self.rows.get(connection), start_ns=start_ns, end_ns=end_ns)
-
 
 @dataclass(slots=True)
 class BlockObserver:
@@ -78,12 +78,19 @@ class BlockObserver:
     """Start of the observed log times; None for all of them."""
     end_ns: int | None = None
     """End of the observed log times, exclusive."""
+    outputs: tuple[TopicMonitor | None, ...] = ()
+    """The monitors of the outputs of the adapter, whose rows they observe like stored rows; None if nothing is expected."""
     _first: int = 0
     """Position on the topic of the first observed message of the current block."""
     _skipped: int = 0
     """Number of messages of the current block before the range."""
     _log_times: Int64s = field(default_factory=lambda: np.zeros(0, np.int64))
     """Log times of the observed messages of the current block."""
+
+    @property
+    def needs_rows(self) -> bool:
+        """Whether log times are not enough."""
+        return self.rows is not None or bool(self.outputs)
 
     def block(self, log_times: Int64s) -> None:
         """Start with a block of messages, whose log times are sorted."""
@@ -97,10 +104,21 @@ class BlockObserver:
         if self.rows is not None and self.rows.needs_messages:
             self.rows.add_messages(*self._observed(rows, index))
 
-    def ontology(self, rows: pa.StructArray, index: Int64s) -> None:
-        """Add the ontology rows of the block; `index` is the position of each row in it."""
-        if self.rows is not None and self.rows.needs_ontology:
-            self.rows.add_ontology(*self._observed(rows, index))
+    def adapted(self, adapted: Adapted, index: Int64s) -> None:
+        """Add the ontology rows of the block; `index` is the position in it of each message that was adapted."""
+        if self.rows is not None and self.rows.needs_ontology and not self.outputs:
+            self.rows.add_ontology(*self._observed(adapted.rows, index[adapted.index]))
+        if self.outputs:
+            for monitor, output in zip(self.outputs, (adapted, *adapted.others), strict=True):
+                if monitor is not None:
+                    self._add_output(monitor, *self._observed(output.rows, index[output.index]))
+
+    def _add_output(self, monitor: TopicMonitor, rows: pa.StructArray, messages: Batch) -> None:
+        first = monitor.add_block(self.connection, messages.log_times)
+        of_rows = monitor.rows.get(self.connection)
+        if of_rows is not None:
+            positions = np.arange(first, first + len(rows), dtype=np.int64)
+            of_rows.add_stored(rows, Batch(messages.log_times, positions))
 
     def _observed(self, rows: pa.StructArray, index: Int64s) -> tuple[pa.StructArray, Batch]:
         """Return the rows inside the range, with their log times and positions on the topic."""

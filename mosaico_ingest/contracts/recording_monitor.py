@@ -53,6 +53,12 @@ class RecordingMonitor:
         self._connections = {connection.id: connection for connection in recording.connections}
         self._of_topic: dict[str, tuple[int, ...]] = {}
         self._monitors: dict[str, TopicMonitor] = {}
+        self._outputs: dict[str, TopicMonitor | None] = {}
+        """The monitors of the outputs of adapters; None if nothing is expected of an output."""
+        self._output_types: dict[str, dict[str, None]] = {}
+        """The message types that each output is made of."""
+        self._outputs_of: dict[int, tuple[TopicMonitor | None, ...]] = {}
+        """The monitors of the outputs of each connection, if something is expected of one of them."""
         references = referenced_topics(contract)
         for topic in topics:
             self._add(topic, references)
@@ -70,7 +76,8 @@ class RecordingMonitor:
         if monitor is None:
             return None
         start_ns, end_ns = self._range
-        return monitor.observer(connection, start_ns=start_ns, end_ns=end_ns)
+        rows, outputs = monitor.rows.get(connection), self._outputs_of.get(connection, ())
+        return BlockObserver(monitor, connection, rows, start_ns, end_ns, outputs)
 
     @property
     def observed(self) -> Mapping[str, TopicMonitor]:
@@ -85,8 +92,9 @@ class RecordingMonitor:
 
     def finish(self) -> ContractResult:
         """Return the results, after all messages were observed."""
-        for monitor in self._monitors.values():
-            monitor.finish()
+        for monitor in (*self._monitors.values(), *self._outputs.values()):
+            if monitor is not None:
+                monitor.finish()
         facts = self._facts()
         return evaluate(
             self._contract,
@@ -101,6 +109,8 @@ class RecordingMonitor:
     def _add(self, topic: ReadTopic, references: frozenset[str]) -> None:
         known = self._of_topic.get(topic.topic, ())
         self._of_topic[topic.topic] = (*known, *topic.connections)
+        if self._add_outputs(topic, references):
+            references |= {topic.topic}
         monitor = self._monitors.get(topic.topic) or topic_monitor(self._contract, topic.topic, references)
         if monitor is None:
             return
@@ -115,6 +125,32 @@ class RecordingMonitor:
         filled = [key for key in self._of_topic[topic.topic] if self._connections[key].count != 0]
         monitor.is_merged = len(filled) > 1
 
+    def _add_outputs(self, topic: ReadTopic, references: frozenset[str]) -> bool:
+        """Add the monitors of the outputs of a topic's adapter; return whether something is expected of one of them."""
+        msgtypes = dict.fromkeys(self._connections[key].msgtype for key in topic.connections)
+        for name, _ in topic.outputs:
+            is_known = name in self._outputs
+            if not is_known:
+                listed = {name} if self._contract.lists(name) else set[str]()
+                self._outputs[name] = topic_monitor(self._contract, name, references | listed)
+            self._output_types[name] = self._output_types.get(name, {}) | msgtypes
+            monitor = self._outputs[name]
+            if monitor is not None:
+                monitor.is_merged = is_known or len(topic.connections) > 1
+        monitors = tuple(self._outputs[name] for name, _ in topic.outputs)
+        if not any(monitors):
+            return False
+        from mosaico_ingest.contracts.row_monitor import output_monitor  # noqa: PLC0415 - as for the rows of topics
+
+        for key in topic.connections:
+            self._outputs_of[key] = monitors
+            for monitor, (name, ontology) in zip(monitors, topic.outputs, strict=True):
+                if monitor is not None and monitor.has_rows:
+                    rows, _ = output_monitor(self._contract, self._connections[key], name, ontology)
+                    if rows is not None:
+                        monitor.rows[key] = rows
+        return True
+
     def _facts(self) -> Facts:
         recording = self._recording
         topics: dict[str, TopicFacts] = {}
@@ -127,6 +163,11 @@ class RecordingMonitor:
                 count=self._count(name, own),
                 monitor=self._monitors.get(name),
                 unread=self._excluded.get(name),
+            )
+        for name, monitor in self._outputs.items():
+            count = None if monitor is None or not monitor.is_observed else monitor.read
+            topics[name] = TopicFacts(
+                name, tuple(self._output_types[name]), count=count, monitor=monitor, is_output=True
             )
         start_ns, end_ns = self._span()
         return Facts(
@@ -200,7 +241,7 @@ class RecordingMonitor:
             before, count = counts.get(connection.topic, 0), self._count_in_files(connection)
             counts[connection.topic] = None if before is None or count is None else before + count
         if None in counts.values() and self._range == (None, None):
-            counts = {name: topic.count for name, topic in facts.topics.items()}
+            counts = {name: topic.count for name, topic in facts.topics.items() if not topic.is_output}
         different = [
             f"{name}: {count_text(promised.get(name, 0))} in metadata.yaml, {count_text(count)} in the files"
             for name in dict.fromkeys([*promised, *counts])

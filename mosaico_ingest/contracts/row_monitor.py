@@ -47,6 +47,7 @@ from mosaico_ingest.contracts.values import (
 )
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding
+from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.blocks import Connection
 
 
@@ -199,6 +200,13 @@ def connection_monitor(
     return row_monitor(contract, topic.topic, connection.msgtype, message, ontology)
 
 
+def output_monitor(
+    contract: Contract, connection: Connection, name: str, ontology: OntologyType
+) -> tuple[RowMonitor | None, list[Finding]]:
+    """Return the monitor of the rows of an output of an adapter as `row_monitor` does."""
+    return row_monitor(contract, name, connection.msgtype, None, ontology_rows(ontology), stored=True)
+
+
 def check_expressions(
     contract: Contract, connections: Sequence[Connection], topics: Iterable[ReadTopic]
 ) -> None:
@@ -230,6 +238,9 @@ def _expression_findings(
                 continue  # the violated type is the cause
             _, mistakes = connection_monitor(contract, by_id[key], topic)
             findings.update(dict.fromkeys(mistakes))
+            for name, ontology in topic.outputs:
+                _, mistakes = output_monitor(contract, by_id[key], name, ontology)
+                findings.update(dict.fromkeys(mistakes))
     return list(findings)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.adapters.bridge import ROSBridge, outputs_of
 from mosaico_ingest.contracts.expressions import (
     Rows,
     bind_expression,
@@ -19,6 +19,7 @@ from mosaico_ingest.errors import AdapterError, BagError, ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.expect import AllowedNames, Expectations, TopicExpectations
 from mosaico_ingest.lint.job import Job
+from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 
@@ -58,7 +59,7 @@ def condition_findings(job: Job) -> Iterator[Finding]:
 
 def _rows(
     job: Job, expect: Expectations, topic: str, entry: TopicExpectations
-) -> Iterator[tuple[Rows, Rows | None]]:
+) -> Iterator[tuple[Rows | None, Rows | None]]:
     """Yield the message type and the ontology type of each type that a topic is expected to have."""
     expected = entry.type
     if expected is None and (other := expect.entry_of(topic, "type")) is not None:
@@ -73,20 +74,25 @@ def _rows(
                 definition = resolver.resolve(name, None, ros_version=version)
             except BagError:
                 continue
-            message = message_rows(definition)
-            yield message, _ontology(job, topic, message, definition.root)
+            yield _rows_of_type(job, topic, definition)
             break
 
 
-def _ontology(job: Job, topic: str, message: Rows, msgtype: str) -> Rows | None:
-    adapters = job.manifest.adapters
+def _rows_of_type(job: Job, topic: str, definition: Definition) -> tuple[Rows | None, Rows | None]:
+    """Return the messages and the ontology rows of a topic; an output of an adapter has only ontology rows."""
+    adapters, message = job.manifest.adapters, message_rows(definition)
     try:
         bridge = ROSBridge(overrides=adapters.override, loaded=adapters.load, base_dir=job.folder)
-        spec = bridge.resolve(topic, msgtype).spec
-        definition = _resolver(job).resolve(msgtype, None, ros_version=2)
-        return ontology_rows(spec.bind(definition, message.struct).ontology)
+        source, _, name = topic.rpartition("/")
+        for output in outputs_of(bridge.resolve(source, definition.root).spec) if source else ():
+            if output.output == name:
+                return None, ontology_rows(output.bind(definition, message.struct).ontology)
+        spec = bridge.resolve(topic, definition.root).spec
+        if outputs_of(spec):
+            return message, None
+        return message, ontology_rows(spec.bind(definition, message.struct).ontology)
     except (AdapterError, BagError, ManifestError):
-        return None
+        return message, None
 
 
 def _resolver(job: Job) -> TypeResolver:

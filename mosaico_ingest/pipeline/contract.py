@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import ContractError
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import PROVENANCE_KEY, OnFailure
-from mosaico_ingest.pipeline.plan import Plan
+from mosaico_ingest.pipeline.plan import Plan, observed_topics
 from mosaico_ingest.pipeline.provenance import SequenceRequest
 from mosaico_ingest.pipeline.topic import TopicPipeline, pipelines_by_connection
 from mosaico_ingest.report.contract import ContractResult
@@ -100,7 +100,7 @@ def monitor_of(plan: Plan, recording: Recording) -> RecordingMonitor | None:
     return RecordingMonitor(
         plan.contract,
         recording,
-        [topic.as_read for topic in plan.read_topics],
+        observed_topics(plan.topics),
         excluded={topic.topic: topic.why for topic in plan.excluded},
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,

@@ -61,7 +61,12 @@ def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
     else:
         add_times(monitor, times)
     results = () if monitor is None else monitor.finish().results
-    return [result for result in results if _is_known(result, has_times=times is not None)]
+    outputs = {topic.target for topic in plan.topics if topic.output}
+    return [
+        result
+        for result in results
+        if result.topic not in outputs and _is_known(result, has_times=times is not None)
+    ]
 
 
 def sample_results(monitor: RecordingMonitor) -> list[ExpectationResult]:
@@ -90,7 +95,7 @@ def _observe(plan: Plan, contract: Contract, recording: Recording, monitor: Reco
     reads_all = any(clause.key in WHOLE_FILE_KEYS for clause in contract.recording_clauses())
     if not reads_all:
         observers = {key: observer for key, observer in observers.items() if observer is not None}
-    timed = [key for key, observer in observers.items() if observer is None or observer.rows is None]
+    timed = [key for key, observer in observers.items() if observer is None or not observer.needs_rows]
     if reads_all or monitor.order is not None:
         timed = []
     times = (
@@ -136,8 +141,8 @@ class _Rows:
         self._monitor = monitor
         self._read = 0
         rows = observer.rows
-        self._decodes = rows is not None
-        self._adapts = rows is not None and rows.needs_ontology
+        self._adapts = bool(observer.outputs) or (rows is not None and rows.needs_ontology)
+        self._decodes = self._adapts or rows is not None
         self._decoder = decoder_for(connection) if self._decodes else None
         definition = connection.definition
         self._adapter = (
@@ -174,7 +179,7 @@ class _Rows:
             except AdapterError:
                 rejected += len(index)
             else:
-                self._observer.ontology(adapted.rows, index[adapted.index])
+                self._observer.adapted(adapted, index)
                 rejected += len(adapted.failures)
             self._monitor.reject(self._topic.topic, rejected)
 

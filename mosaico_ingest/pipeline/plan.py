@@ -187,9 +187,9 @@ class TopicPlan(Part):
     """True if another topic counts the same messages, because the adapter has several outputs."""
 
     @property
-    def as_read(self) -> ReadTopic:
-        """The topic as a data contract observes it."""
-        return ReadTopic(self.topic, self.connections, self.ontology)
+    def output(self) -> str:
+        """The name of the output of its adapter that the topic is; empty for an adapter without `outputs`."""
+        return self.adapter.output if isinstance(self.adapter, MappingSpec) else ""
 
     @property
     def has_conditions(self) -> bool:
@@ -200,6 +200,24 @@ class TopicPlan(Part):
     def has_log_times(self) -> bool:
         """Whether the times of the rows are the log times."""
         return self.stamp is StampSource.LOG and self.time_offset_ns == 0
+
+
+def observed_topics(topics: Sequence[TopicPlan]) -> list[ReadTopic]:
+    """Return the topics as a data contract observes them: with all outputs of adapters that have `outputs`."""
+    outputs: dict[int, list[tuple[str, OntologyType]]] = {}
+    for topic in topics:
+        if topic.output:
+            outputs.setdefault(topic.connections[0], []).append((topic.target, topic.ontology))
+    return [
+        ReadTopic(
+            topic.topic,
+            topic.connections,
+            None if topic.output else topic.ontology,
+            tuple(outputs[topic.connections[0]]) if topic.output else (),
+        )
+        for topic in topics
+        if not topic.shares_messages
+    ]
 
 
 class ExcludedTopic(Part):

@@ -24,7 +24,7 @@ from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, StampSource, 
 from mosaico_ingest.pipeline.attachments import kept_content
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget
-from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of
+from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of, observed_topics
 from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.rosbag.blocks import Connection, Encoding
@@ -176,8 +176,7 @@ def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Reco
     if contract is not None:
         from mosaico_ingest.contracts.row_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
 
-        read = [topic.as_read for topic in topics if not topic.shares_messages]
-        check_expressions(contract, recording.connections, read)
+        check_expressions(contract, recording.connections, observed_topics(topics))
     return contract
 
 

@@ -241,7 +241,7 @@ class TopicPipeline:
             for failure in adapted.failures
         ]
         if observer is not None:
-            observer.ontology(adapted.rows, index[adapted.index])
+            observer.adapted(adapted, index)
         rejections.sort(key=lambda rejection: rejection.failure.row)
         return _Converted(
             tuple(

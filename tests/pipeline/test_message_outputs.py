@@ -286,3 +286,83 @@ def test_wrong_parameter_has_one_rule_and_location_in_lint_and_run(
         assert finding.span is not None
         assert finding.span.line == 9
     assert linted.span == compiled.span
+
+
+def expected_of_outputs(folder: Path) -> dict[str, Any]:
+    topics = {
+        "/batch": {"messages": {"min": 6}, "fields": {"name": {"one_of": ["a"]}}},
+        "/batch/items": {
+            "type": "acme_msgs/msg/Batch",
+            "messages": {"max": 9},
+            "gap": {"max": "1 ns"},
+            "fields": {"id": {"max": 6}},
+        },
+        "/batch/heavy": {"fields": {"total": {"between": [150, 202]}}},
+    }
+    expect = {"on_failure": "warn", "required": ["/batch/heavy"], "topics": topics}
+    (folder / "expect.yaml").write_text(json.dumps({"expect": expect}))
+    return expect
+
+
+def measured_of(contract: Any) -> dict[tuple[str | None, str], tuple[str, Any, Any]]:
+    return {
+        (one.topic, one.key): (one.outcome.value, one.measured, one.worst and one.worst.index)
+        for one in contract.results
+    }
+
+
+def test_contract_checks_the_columns_of_each_output(tmp_path: Path) -> None:
+    recording(tmp_path)
+    report = run(tmp_path, OUTPUTS_FILE, expect=expected_of_outputs(tmp_path)).report
+    results = measured_of(report.contract)
+    assert {key: value for key, value in results.items() if key[0] != "/batch"} == {
+        (None, "required.0"): ("passed", 1, None),
+        ("/batch/items", "type"): ("passed", "acme_msgs/msg/Batch", None),
+        ("/batch/items", "messages"): ("passed", 6, None),
+        ("/batch/items", "gap"): ("failed", 3, 2),
+        ("/batch/items", "fields.id.max"): ("failed", 8, 5),
+        ("/batch/heavy", "fields.total.between"): ("passed", 152.0, None),
+    }
+    assert results["/batch", "messages"][:2] == ("passed", 6)
+    checked = api.check_sequence(str(tmp_path / "store"), "s", tmp_path / "expect.yaml")
+    in_store = measured_of(checked.contract)
+    assert {key: in_store[key] for key in results if key[0] != "/batch"} == {
+        key: value for key, value in results.items() if key[0] != "/batch"
+    }
+    (again,) = api.check(tmp_path / "job.yaml")
+    assert measured_of(again.contract) == results
+    (planned,) = api.plan_job(tmp_path / "job.yaml").recordings
+    assert planned.contract is not None
+    of_outputs = {
+        (one.topic, one.key) for one in planned.contract.results if one.topic not in {None, "/batch"}
+    }
+    assert of_outputs == {("/batch/items", "fields.id.max")}  # the sample reveals it
+
+
+def test_contract_unknown_column_of_output_is_a_located_error(tmp_path: Path) -> None:
+    recording(tmp_path)
+    topics = {"/batch/heavy": {"fields": {"totl": {"max": 1}}}}
+    with pytest.raises(ManifestError) as error:
+        make_plan(job(tmp_path, OUTPUTS_FILE, expect={"topics": topics}))
+    (finding,) = error.value.findings
+    assert finding.rule == "unknown-field"
+    assert "total" in (finding.help or "")
+
+
+def test_lint_checks_columns_of_outputs_of_known_types(tmp_path: Path) -> None:
+    adapter = (
+        "version: 1\nadapter: Split\nros_type: std_msgs/msg/Int32\ndefault: false\noutputs:\n"
+        "  low: {ontology: {tag: Low, fields: {bits: int32}}, fields: {bits: data & 255}}\n"
+        "  high: {ontology: {tag: High, fields: {rest: int32}}, fields: {rest: data >> 8}}\n"
+    )
+    (tmp_path / "split.yaml").write_text(adapter)
+    (tmp_path / "job.yaml").write_text(
+        "bag: {path: a.mcap}\nadapters: {override: {/n: split.yaml}}\nexpect:\n  topics:\n"
+        '    "/n*": {type: std_msgs/msg/Int32}\n    /n: {fields: {data: {max: 9}, bits: {max: 9}}}\n'
+        "    /n/low: {fields: {bits: {max: 9}}}\n    /n/high: {fields: {bits: {max: 9}}}\n"
+    )
+    findings = lint_paths([tmp_path / "job.yaml"], env={}).findings
+    unknown = [
+        one.span and (one.span.line, one.span.column) for one in findings if one.rule == "unknown-field"
+    ]
+    assert unknown == [(6, 35), (8, 24)]
