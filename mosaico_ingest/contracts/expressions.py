@@ -42,11 +42,13 @@ class Rows(Struct, frozen=True):
     """The message type; None for ontology rows."""
     title: str = "the rows"
     """The name in messages, such as `IMU`."""
+    has_envelope: bool = False
+    """Whether expressions can use `message.log_time` and the other properties of messages besides their content."""
 
     @property
     def scope(self) -> Scope:
         """The names that expressions can use."""
-        return Scope(ExprType(self.struct, msgtype=self.root), self.types)
+        return Scope(ExprType(self.struct, msgtype=self.root), self.types, has_envelope=self.has_envelope)
 
 
 class FieldExpression(Struct, frozen=True):
@@ -176,9 +178,8 @@ class Evaluator:
             accepted[remaining[list(error.rejections)]] = False
             remaining = np.flatnonzero(accepted)
             rows = self._rows.filter(arrays.array(accepted))
-            envelope = replace(self._envelope, log_times=self._envelope.log_times[accepted])
             try:
-                values = _values(Evaluation(rows, envelope), expression)
+                values = _values(Evaluation(rows, self._envelope.take(accepted)), expression)
                 break
             except RowsRejected as again:
                 error = again

@@ -30,7 +30,7 @@ from typing_extensions import Self
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
-from mosaico_ingest.job.adapter_reference import AdapterReference, LoadedAdapter
+from mosaico_ingest.job.adapter_reference import LoadedAdapter
 from mosaico_ingest.job.expect import Duration, Expectations, Frequency, SignedDuration
 from mosaico_ingest.job.fields import FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
 from mosaico_ingest.job.file_names import FileNamePattern
@@ -262,7 +262,7 @@ class TopicSettings(Section):
     time_offset: SignedDuration = Field(default=0, examples=["-250ms"])
     """A duration to add to every time of the topic, for a clock that is known to be wrong."""
     where: Text | None = Field(default=None, examples=["linear_acceleration.z > 5", "status.status >= 0"])
-    """Keep messages for which this expression over their fields is true; its language is that of mappings."""
+    """Keep messages for which this expression over their fields and `message.*` is true; its language is that of mappings."""
     on_change: tuple[Text, ...] = Field(default=(), examples=[["mode", "header.frame_id"]])
     """Keep messages for which one of these expressions differs from the previous message that `where` keeps."""
     every: Count = Field(default=1, examples=[3])
@@ -300,7 +300,13 @@ class AdapterSettings(Section):
     )
     """Adapters for every topic of their types: YAML files, `module:Class` or `file.py:Class`. `{file: …, with: {…}}` sets
     parameters of a YAML file."""
-    override: dict[Topic, AdapterReference] = Field(default={}, examples=[{"/lidar/*": "LidarAdapter"}])
+    override: dict[Topic, LoadedAdapter] = Field(
+        default={},
+        examples=[
+            {"/lidar/*": "LidarAdapter"},
+            {"/pack/rear": {"file": "adapters/battery_pack.yaml", "with": {"cells": 24}}},
+        ],
+    )
     """The adapter for a topic name or glob, written as in `load` or as the name of a built-in adapter. The exact topic name
     takes precedence, followed by the first matching glob."""
     python: bool = True

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
@@ -44,9 +45,13 @@ class Conditions(Struct, frozen=True):
 
 def bind_conditions(plan: TopicPlan, definition: Definition) -> Conditions:
     """Return the conditions of a plan that `check_conditions` accepted."""
-    rows = message_rows(definition)
+    rows = _condition_rows(definition)
     where = None if plan.where is None else _bind(plan.where, rows)
     return Conditions(where, tuple(_bind(text, rows) for text in plan.on_change))
+
+
+def _condition_rows(definition: Definition) -> Rows:
+    return replace(message_rows(definition), has_envelope=True)
 
 
 def _bind(text: str, rows: Rows) -> FieldExpression:
@@ -70,7 +75,7 @@ def check_conditions(job: Job, topics: Iterable[TopicPlan], connections: Sequenc
             for number in topic.connections:
                 definition = by_id[number].definition
                 if definition is not None:
-                    mistakes = condition_findings(path, text, message_rows(definition), locate)
+                    mistakes = condition_findings(path, text, _condition_rows(definition), locate)
                     findings.update(dict.fromkeys(mistakes))
     if findings:
         first, *rest = findings
@@ -136,8 +141,8 @@ class ConditionFilter:
         changed = keep.copy()
         if conditions.on_change and keep.any():
             kept = rows if keep.all() else rows.filter(pa.array(keep))
-            times = Envelope(envelope.topic, envelope.msgtype, envelope.log_times[keep])
-            changed[keep] = self._changes(conditions.on_change, Evaluator(kept, times), len(kept))
+            evaluator = Evaluator(kept, envelope.take(keep))
+            changed[keep] = self._changes(conditions.on_change, evaluator, len(kept))
         return keep, changed
 
     def _changes(self, expressions: Sequence[FieldExpression], evaluator: Evaluator, count: int) -> Mask:

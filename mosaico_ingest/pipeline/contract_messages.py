@@ -170,18 +170,21 @@ class _Rows:
         self._observer.messages(rows, index)
         rejected = len(decoded.failures)
         if self._adapter is not None:
-            topic = self._topic
-            envelope = Envelope(
-                topic.topic, topic.msgtype, block.log_times, block.publish_times, block.sequences
-            ).take(index)
             try:
-                adapted = self._adapter.adapt(rows, envelope)
+                adapted = self._adapter.adapt(rows, self._envelope(block, index))
             except AdapterError:
                 rejected += len(index)
             else:
                 self._observer.adapted(adapted, index)
                 rejected += len(adapted.failures)
             self._monitor.reject(self._topic.topic, rejected)
+
+    def _envelope(self, block: MessageBlock, index: Int64s) -> Envelope:
+        """Return the envelope of some messages of a block."""
+        topic = self._topic
+        return Envelope(
+            topic.topic, topic.msgtype, block.log_times, block.publish_times, block.sequences
+        ).take(index)
 
     def _selected(
         self, block: MessageBlock, rows: pa.StructArray, index: Int64s
@@ -193,6 +196,6 @@ class _Rows:
         publish_times = None if block.publish_times is None else block.publish_times[index]
         topic = self._topic
         times = row_times(topic.stamp, topic.time_offset_ns, rows, log_times, publish_times)
-        envelope = Envelope(self._topic.topic, self._topic.msgtype, log_times)
+        envelope = self._envelope(block, index)
         keep, _ = self._selector.select(times.values, rows, envelope, self._conditions)
         return (rows, index) if keep is None else (rows.filter(pa.array(keep)), index[keep])

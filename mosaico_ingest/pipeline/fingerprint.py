@@ -162,7 +162,7 @@ def _job_parts(job: Job) -> Iterator[bytes]:
 
 def _adapter_parts(job: Job) -> Iterator[bytes]:
     """Yield the adapters outside of the manifest: files with their neighbors, classes, registered and installed ones."""
-    for reference in (*map(reference_of, job.adapters.load), *job.adapters.override.values()):
+    for reference in map(reference_of, (*job.adapters.load, *job.adapters.override.values())):
         if not isinstance(reference, str):
             raise TypeError("an adapter is an object")
         if reference.endswith((".yaml", ".yml")):  # a mapping may use other mappings in its folder

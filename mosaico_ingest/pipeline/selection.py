@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
-from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
@@ -123,9 +122,7 @@ class RowSelector:
             remaining = rows if keep.all() else rows.filter(pa.array(keep))
             where, on_change = (
                 _scattered(mask, keep)
-                for mask in self._filter.select(
-                    conditions, remaining, replace(envelope, log_times=envelope.log_times[keep])
-                )
+                for mask in self._filter.select(conditions, remaining, envelope.take(keep))
             )
             dropped |= {"where": keep & ~where, "on_change": where & ~on_change}
             keep = on_change

@@ -258,24 +258,27 @@ fields: {log: message.log_time, publish: message.publish_time, topic: message.to
     )
 
 
-def test_parameters_of_the_manifest_replace_the_defaults(tmp_path: Path) -> None:
+@pytest.mark.parametrize("is_override", [False, True])
+def test_parameters_of_the_manifest_replace_the_defaults(tmp_path: Path, *, is_override: bool) -> None:
     recording(tmp_path)
-    load = [{"file": "items.yaml", "with": {"heavy": 160}}]
-    items, heavy = run(tmp_path, OUTPUTS_FILE, adapters={"load": load}).report.topics
+    adapter = {"file": "items.yaml", "with": {"heavy": 160}}
+    adapters = {"override": {"/batch": adapter}} if is_override else {"load": [adapter]}
+    items, heavy = run(tmp_path, OUTPUTS_FILE, adapters=adapters).report.topics
     assert (numbers(items), numbers(heavy)) == ((6, 3, 6, 2, 1), (6, 3, 1, 2, 1))
     assert [row["total"] for row in stored(tmp_path, "/batch/heavy")] == [201.0]
 
 
 @pytest.mark.parametrize("values", [{"hevy": 160}, {"heavy": "160"}])
+@pytest.mark.parametrize("entry", ["load:\n    - file:", "override:\n    /batch:\n      file:"])
 def test_wrong_parameter_has_one_rule_and_location_in_lint_and_run(
-    tmp_path: Path, values: dict[str, object]
+    tmp_path: Path, values: dict[str, object], entry: str
 ) -> None:
     recording(tmp_path)
     [(name, value)] = values.items()
     (tmp_path / "items.yaml").write_text(OUTPUTS_FILE)
     (tmp_path / "job.yaml").write_text(
         "version: 1\nbag: {path: batches.mcap}\nsequence: {name: s}\ntarget: {store: store}\n"
-        f"adapters:\n  load:\n    - file: items.yaml\n      with:\n        {name}: {json.dumps(value)}\n"
+        f"adapters:\n  {entry} items.yaml\n      with:\n        {name}: {json.dumps(value)}\n"
     )
     [linted] = lint_paths([tmp_path / "job.yaml"], env={}).findings
     with pytest.raises(ManifestError) as caught:
@@ -284,7 +287,7 @@ def test_wrong_parameter_has_one_rule_and_location_in_lint_and_run(
     for finding in (linted, compiled):
         assert finding.rule == "adapter-parameter"
         assert finding.span is not None
-        assert finding.span.line == 9
+        assert finding.span.line == 9 + entry.startswith("override")
     assert linted.span == compiled.span
 
 

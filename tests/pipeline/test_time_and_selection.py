@@ -422,9 +422,29 @@ def published_recording(path: Path) -> Path:
         serializer = Serializer(PLAIN, Encoding.CDR)
         for value, published_ns in enumerate((START_NS - 5, START_NS + 5, 0)):
             payload = serializer.from_dict({"data": value})
-            writer.add_message(channel, START_NS + 10 * value, payload, published_ns)
+            writer.add_message(channel, START_NS + 10 * value, payload, published_ns, sequence=7 + value)
         writer.finish()
     return path
+
+
+@pytest.mark.parametrize(
+    ("settings", "values"),
+    [
+        ({"where": f"message.log_time >= {START_NS + 10}"}, [1, 2]),
+        ({"where": "message.publish_time < message.log_time and message.publish_time > 0"}, [0, 1]),
+        ({"where": "message.sequence != 8"}, [0, 2]),
+        ({"where": "message.topic == '/a' and data != 1"}, [0, 2]),
+        ({"where": "data > 0", "on_change": ["message.sequence"]}, [1, 2]),
+        ({"on_change": ["message.topic"]}, [0]),
+        ({"where": "100 // data > message.sequence"}, [1, 2]),  # the first message has no value
+    ],
+)
+def test_conditions_use_the_properties_of_messages(
+    tmp_path: Path, settings: Mapping[str, object], values: list[int]
+) -> None:
+    path = published_recording(tmp_path / "drive.mcap")
+    _, store = run(path, topic_settings={"/a": settings})
+    assert [value for _, value in rows(store, "/a", "data")] == values
 
 
 def test_stamp_publish_uses_publish_times_of_mcap(tmp_path: Path) -> None:

@@ -13,7 +13,11 @@ from mosaico_ingest.lint.rule import Check, Problem
 
 def check(job: Job) -> Iterator[Problem]:
     """Report each value in `with` that the adapter file does not accept."""
-    for position, adapter in enumerate(job.manifest.adapters.load):
+    adapters = job.manifest.adapters
+    for *path, adapter in (
+        *(("load", position, adapter) for position, adapter in enumerate(adapters.load)),
+        *(("override", topic, adapter) for topic, adapter in adapters.override.items()),
+    ):
         if not isinstance(adapter, ParameterizedAdapter) or not job.is_expanded(adapter.file):
             continue
         source = load_mapping_source(job.resolve(adapter.file))
@@ -25,7 +29,7 @@ def check(job: Job) -> Iterator[Problem]:
         for name, value in adapter.values.items():
             problem, hint = parameter_problem(defaults, name, value)
             if problem is not None:
-                span = job.source.span(("adapters", "load", position, "with", name))
+                span = job.source.span(("adapters", *path, "with", name))
                 yield Problem(f"{adapter}: {problem}", span, hint)
 
 

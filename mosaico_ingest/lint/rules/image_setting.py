@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.image import IMAGE_TAG
+from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.image import image_settings
 from mosaico_ingest.job.patterns import first_match, is_glob
 from mosaico_ingest.lint.job import Job
@@ -20,7 +21,7 @@ def check(job: Job) -> Iterator[Problem]:
     overrides = job.manifest.adapters.override
     for topic, setting in job.manifest.topic_settings.items():
         pattern = topic if is_glob(topic) else first_match(overrides, topic)
-        adapter = BY_NAME.get(overrides.get(pattern or "", ""))
+        adapter = BY_NAME.get(reference_of(overrides.get(pattern or "")))
         image = image_settings(setting.image).format
         if image != "raw" and adapter is not None and adapter.tag != IMAGE_TAG:
             message = f"image: {image} has no effect, because {topic} becomes {adapter.tag}, not {IMAGE_TAG}"
