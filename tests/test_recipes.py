@@ -6,9 +6,10 @@ import io
 import re
 import shutil
 import sqlite3
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from contextlib import closing
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -77,6 +78,21 @@ def fix(at: int, at_ns: int) -> dict[str, Any]:
     return {"header": header(at_ns, "gps"), "status": {"status": 0, "service": 1}, **position, **covariance}
 
 
+def joints(at: int, at_ns: int) -> dict[str, Any]:
+    """Return the positions of two joints, whose order changes, and of none in the last message."""
+    names = [] if at == 19 else ["elbow", "shoulder"] if at % 2 else ["shoulder", "elbow"]
+    position = [at + 0.5 * (name == "elbow") for name in names]
+    return {"header": header(at_ns, "arm"), "name": names, "position": position, "velocity": [], "effort": []}
+
+
+def status(at: int, at_ns: int) -> dict[str, Any]:
+    """Return the diagnostics of a motor, and in every other message those of a battery, the last of which is an error."""
+    motor = {"level": 0, "name": "motor", "message": "", "hardware_id": "", "values": []}
+    values = [{"key": "cells", "value": "12"}, {"key": "voltage", "value": f"{24 + at / 10}"}]
+    battery = {**motor, "level": 2 * (at == 18), "name": "battery", "values": values}
+    return {"header": header(at_ns, ""), "status": [motor] if at % 2 else [motor, battery]}
+
+
 def drive() -> Messages:
     """Return 20 seconds of a small robot."""
     resolver = TypeResolver(Stores.LATEST)
@@ -84,9 +100,10 @@ def drive() -> Messages:
         name: resolver.resolve(name, None, ros_version=2)
         for name in (
             "sensor_msgs/msg/Imu", "sensor_msgs/msg/Image", "sensor_msgs/msg/NavSatFix", "std_msgs/msg/String", "tf2_msgs/msg/TFMessage",
+            "sensor_msgs/msg/JointState", "diagnostic_msgs/msg/DiagnosticArray",
         )
     }  # fmt: skip
-    imu_type, image, gps, text, tf = standard.values()
+    imu_type, image, gps, text, tf, joint_state, diagnostics = standard.values()
     wheel = define("acme_msgs/msg/Wheel", WHEEL)
     messages: Messages = [("/tf_static", tf, START_NS, transform("base", "imu", START_NS))]
     for at in range(200):
@@ -100,6 +117,9 @@ def drive() -> Messages:
             messages.append(("/camera/debug", image, at_ns, picture(0, at_ns)))
             messages.append(("/gps/fix", gps, at_ns, fix(at // 10, at_ns)))
             messages.append(("/wheel", wheel, at_ns, {"rpm": float(at), "side": "left"}))
+            messages.append(("/wheel/rear", wheel, at_ns, {"rpm": float(at), "side": "rear"}))
+            messages.append(("/joint_states", joint_state, at_ns, joints(at // 10, at_ns)))
+            messages.append(("/diagnostics", diagnostics, at_ns, status(at // 10, at_ns)))
             messages.append(("/robot/mode", text, at_ns, {"data": "drive" if at // 10 % 8 >= 4 else "idle"}))
     return messages
 
@@ -112,12 +132,9 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "events.csv").write_text(EVENTS)
     (folder / "acme_msgs").mkdir()
     (folder / "acme_msgs" / "Wheel.msg").write_text(WHEEL)
-    (adapter,) = [
-        text
-        for text in recipes()["How do I get my own message type as columns with units?"]
-        if "# wheel.yaml" in text
-    ]
-    (folder / "wheel.yaml").write_text(adapter)
+    for _, *adapters in recipes().values():
+        for text in adapters:
+            (folder / text.partition("\n")[0].removeprefix("# ")).write_text(text)
     record(folder / "drive.mcap", messages)
     for name in ("splits", "fleet"):
         (folder / name).mkdir()
@@ -136,6 +153,11 @@ def files(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for robot in (7, 8):
         write_counts(folder / "fleet" / f"robot{robot}_20260301.mcap", {"serial": f"A-{robot}"})
     write_counts(folder / "damaged.mcap", {}, damaged=2)
+    write_counts(
+        folder / "attached.mcap",
+        {"serial": "A-7"},
+        attachments={"camera.yaml": b"fx: 500", "log.txt": b"started"},
+    )
     return folder
 
 
@@ -154,7 +176,13 @@ def random_pictures(messages: Messages) -> Messages:
     ]
 
 
-def write_counts(path: Path, vehicle: dict[str, str], *, damaged: int | None = None) -> None:
+def write_counts(
+    path: Path,
+    vehicle: dict[str, str],
+    *,
+    damaged: int | None = None,
+    attachments: Mapping[str, bytes] = MappingProxyType({}),
+) -> None:
     """Write five numbers, one of which can be truncated."""
     with path.open("wb") as file:
         writer = Writer(file)
@@ -166,6 +194,8 @@ def write_counts(path: Path, vehicle: dict[str, str], *, damaged: int | None = N
             writer.add_message(channel, START_NS + number, payload, START_NS + number)
         if vehicle:
             writer.add_metadata("vehicle", vehicle)
+        for name, content in attachments.items():
+            writer.add_attachment(START_NS, START_NS, name, "text/plain", content)
         writer.finish()
 
 
@@ -267,6 +297,39 @@ def check_wheels(store: Store) -> None:
     assert store.topic("wheels", "/wheel").ontology.tag == "WheelSpeed"
 
 
+def check_arm(store: Store) -> None:
+    stored = [(row["shoulder"], row["elbow"]) for row in rows(store, "arm", "/joint_states")]
+    assert stored == [*((float(at), at + 0.5) for at in range(19)), (None, None)]
+
+
+def check_battery(store: Store) -> None:
+    stored = [row["voltage"] for row in rows(store, "battery", "/diagnostics")]
+    assert stored == pytest.approx([24 + at / 10 for at in range(0, 20, 2)])
+
+
+def check_transform_rows(store: Store) -> None:
+    stored = [(row["parent"], row["child"], row["x"]) for row in rows(store, "transforms", "/tf")]
+    assert stored == [("odom", "base", 1.0), ("map", "odom", 1.0)] * 20
+
+
+def check_devices(store: Store) -> None:
+    assert topics(store, "devices") == {"/diagnostics/devices": 30, "/diagnostics/errors": 1}
+    [error] = rows(store, "devices", "/diagnostics/errors")
+    assert (error["count"], error["first"]) == (1, "battery")
+
+
+def check_gears(store: Store) -> None:
+    assert [row["rpm"] for row in rows(store, "gears", "/wheel")] == list(range(0, 200, 10))
+    assert [row["rpm"] for row in rows(store, "gears", "/wheel/rear")] == list(range(0, 100, 5))
+
+
+def check_calibrated(store: Store) -> None:
+    info = store.sequence("calibrated")
+    assert info is not None
+    assert [attachment.name for attachment in info.attachments] == ["camera.yaml"]
+    assert "_records_" not in info.metadata
+
+
 def check_small(store: Store) -> None:
     stored = rows(store, "small", "/camera/image_raw")
     assert [(row["format"], row["width"], row["height"]) for row in stored] == [("jpeg", 32, 16)] * 40
@@ -306,8 +369,14 @@ CHECKS: dict[str, tuple[Check, int]] = {
     "The power failed during recording. How do I save the rest of the file?": (check_saved, 4),
     "How do I ingest a folder of recordings, again and again?": (check_fleet, 0),
     "How do I get my own message type as columns with units?": (check_wheels, 0),
+    "How do I get one column per joint?": (check_arm, 0),
+    "How do I get the value of one diagnostics entry as a column?": (check_battery, 0),
+    "How do I get one row per transform of /tf?": (check_transform_rows, 0),
+    "How do I store one message in several topics?": (check_devices, 0),
+    "How do I use one adapter with different parameters?": (check_gears, 0),
     "How do I store camera images in less space?": (check_small, 0),
     "Where do the metadata of my recordings go?": (check_described, 0),
+    "How do I keep the calibration file that is attached to a recording?": (check_calibrated, 0),
     "One bad message stops everything. How do I go on, and keep it?": (check_most, 4),
     "How do I refuse recordings in which a sensor dropped out?": (check_refused, 6),
 }
