@@ -44,15 +44,24 @@ def browse(
         int,
         typer.Option("--port", min=0, max=65535, metavar="PORT", help="Port to listen on; 0 chooses one."),
     ] = DEFAULT_PORT,
+    runs: Annotated[
+        Path | None,
+        typer.Option(
+            "--runs",
+            metavar="FOLDER",
+            help="Folder with reports (`--report`), whose pages are listed.",
+            show_default="STORE/runs",
+        ),
+    ] = None,
 ) -> None:
-    """Show the sequences of a store in a web browser on this machine, until interrupted. Read-only."""
+    """Show the sequences and runs of a store in a web browser on this machine, until interrupted. Read-only."""
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
     from mosaico_ingest.pages.browser import BrowserServer
 
     collect_garbage_as_usual()
     hide_pandas()
     interrupt_on_sigterm()
-    server = BrowserServer(store, port)
+    server = BrowserServer(store, port, runs=runs)
     try:
         typer.echo(f"showing {store} at {server.address}")
         server.serve_forever()

@@ -1,4 +1,4 @@
-"""A web server for one user on the same machine: a searchable list of the sequences of a store, and their pages.
+"""A web server for one user on the same machine: searchable lists of the sequences and runs of a store, and their pages.
 
 The server listens on the loopback address only. It accepts requests whose `Host` is that address, so that a web site cannot
 read the store through a name of its own (DNS rebinding). Names are looked up in the catalog and are never used as paths.
@@ -8,27 +8,40 @@ from __future__ import annotations
 
 import threading
 from collections import OrderedDict
+from collections.abc import Callable
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 from urllib.parse import parse_qs, quote, unquote, urlsplit
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.store import SequenceInfo, Store
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.pages.design import render
+from mosaico_ingest.pages.reports import ReportFolder
+from mosaico_ingest.pages.run import run_page
 from mosaico_ingest.pages.sequence import sequence_page
+from mosaico_ingest.report.model import read_report
 from mosaico_ingest.version import __version__
 
 HOST = "127.0.0.1"
 PAGE_SIZE = 50
 """Sequences on one page of the list."""
 CACHED_PAGES = 16
-"""Pages of sequences that are kept until the sequence changes."""
+"""Pages that are kept until their sequence or report changes."""
 SEQUENCE = "/sequence/"
 """The start of the addresses of sequences."""
+RUNS = "/runs"
+"""The address of the list of runs."""
+RUN = "/run/"
+"""The start of the addresses of runs."""
+RUNS_FOLDER = "runs"
+"""The folder in a store whose report files are listed if no other folder is given."""
+SHOWN_SEQUENCES = 3
+"""Sequences that the list of runs names for each run."""
 TIMEOUT_S = 30
 """Seconds after which an idle connection is closed."""
 HEADERS = {
@@ -52,15 +65,16 @@ class Page(Struct, frozen=True):
 class StoreBrowser:
     """The pages of one store by address; can be used by several threads."""
 
-    def __init__(self, location: str) -> None:
-        """Open the store.
+    def __init__(self, location: str, runs: Path | None = None) -> None:
+        """Open the store; `runs` is the folder of report files, which defaults to `runs` in the folder of the store.
 
         Raises:
             SinkError: The store does not exist.
         """
         Store.open(location, create=False)
         self._location = location
-        self._pages: OrderedDict[str, tuple[SequenceInfo, str]] = OrderedDict()
+        self._reports = ReportFolder(runs or Path(location) / RUNS_FOLDER)
+        self._pages: OrderedDict[str, tuple[object, str]] = OrderedDict()
         self._lock = threading.Lock()
 
     def page(self, address: str) -> Page:
@@ -71,8 +85,12 @@ class StoreBrowser:
                 return Page(HTTPStatus.OK, self._list(parts.query))
             if parts.path.startswith(SEQUENCE):
                 return self._sequence(unquote(parts.path.removeprefix(SEQUENCE)))
+            if parts.path == RUNS:
+                return Page(HTTPStatus.OK, self._runs(parts.query))
+            if parts.path.startswith(RUN):
+                return self._run(unquote(parts.path.removeprefix(RUN)))
         except IngestError as error:
-            return _problem(HTTPStatus.SERVICE_UNAVAILABLE, "The store cannot be read", str(error))
+            return _problem(HTTPStatus.SERVICE_UNAVAILABLE, "The content cannot be read", str(error))
         return _problem(HTTPStatus.NOT_FOUND, "There is no such page", one_line(parts.path))
 
     def _list(self, query: str) -> str:
@@ -99,6 +117,7 @@ class StoreBrowser:
             first_link=f"/?{kept}",
             next_link=f"/?{kept}&after={quote(listing.next_after)}" if listing.next_after else None,
             links={each.name: sequence_link(each.name) for each in listing.sequences},
+            runs_link=RUNS,
             version=__version__,
         )
 
@@ -107,15 +126,49 @@ class StoreBrowser:
         info = store.find_sequence(name)
         if info is None:
             return _problem(HTTPStatus.NOT_FOUND, "There is no such sequence", name)
+        html = self._cached(
+            sequence_link(name),
+            info,
+            lambda: sequence_page(store, name, list_link="/", runs_link=f"{RUNS}?q={quote(name)}"),
+        )
+        return Page(HTTPStatus.OK, html)
+
+    def _runs(self, query: str) -> str:
+        text = parse_qs(query).get("q", [""])[-1]
+        with self._lock:
+            runs = self._reports.summaries(text)
+        names = {name for run in runs for name in run.sequences[:SHOWN_SEQUENCES]}
+        return render(
+            "runs.html",
+            store=self._location,
+            folder=str(self._reports.path),
+            action=RUNS,
+            query=text,
+            runs=runs,
+            links={run.name: f"{RUN}{quote(run.name, safe='')}" for run in runs},
+            sequence_links={name: sequence_link(name) for name in names},
+            shown=SHOWN_SEQUENCES,
+            version=__version__,
+        )
+
+    def _run(self, name: str) -> Page:
+        file = self._reports.find(name)
+        if file is None:
+            return _problem(HTTPStatus.NOT_FOUND, "There is no such run", name)
+        path, signature = file
+        html = self._cached(f"{RUN}{name}", signature, lambda: run_page(read_report(path), list_link=RUNS))
+        return Page(HTTPStatus.OK, html)
+
+    def _cached(self, address: str, state: object, make: Callable[[], str]) -> str:
+        """Return the page of an address, which is computed again only if its state changes."""
         with self._lock:  # pages are expensive, so two requests do not compute the same one
-            known = self._pages.get(name)
-            if known is None or known[0] != info:
-                known = (info, sequence_page(store, name, list_link="/"))
-                self._pages[name] = known
-            self._pages.move_to_end(name)
+            page = self._pages.get(address)
+            if page is None or page[0] != state:
+                page = self._pages[address] = (state, make())
+            self._pages.move_to_end(address)
             while len(self._pages) > CACHED_PAGES:
                 self._pages.popitem(last=False)
-        return Page(HTTPStatus.OK, known[1])
+        return page[1]
 
 
 def sequence_link(name: str) -> str:
@@ -144,14 +197,14 @@ def _problem(status: HTTPStatus, title: str, text: str) -> Page:
 class BrowserServer:
     """The web server of a store; `serve_forever` returns after `close`."""
 
-    def __init__(self, location: str, port: int = 0) -> None:
+    def __init__(self, location: str, port: int = 0, *, runs: Path | None = None) -> None:
         """Listen on the loopback address.
 
         Raises:
             SinkError: The store does not exist.
             OSError: The port is in use.
         """
-        browser = StoreBrowser(location)
+        browser = StoreBrowser(location, runs)
 
         class Handler(_Handler):
             pages = browser

@@ -143,7 +143,7 @@ def step_shares(seconds: Mapping[str, float], *, stacked: bool = True) -> list[S
 class RecordingView:
     """The values of one recording on the page; those of its content are computed when they are rendered."""
 
-    def __init__(self, at: int, run: RunReport, folder: Path) -> None:
+    def __init__(self, at: int, run: RunReport, folder: Path | None) -> None:
         report = run.recordings[at]
         self.report = report
         self.id = f"r{at}"
@@ -199,7 +199,7 @@ class RecordingView:
     @property
     def quarantine_link(self) -> str | None:
         """The link to the folder of the quarantine."""
-        return folder_link(self.report, self._folder)
+        return None if self._folder is None else folder_link(self.report, self._folder)
 
     @property
     def replay_command(self) -> str | None:

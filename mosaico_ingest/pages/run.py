@@ -41,15 +41,25 @@ MAX_RESULTS = 200
 """Expectations that the table lists; failed ones come first."""
 
 
-def run_page(report: RunReport, folder: Path | None = None, comparison: Comparison | None = None) -> str:
-    """Return the page; links to files are relative to `folder` (default: the current one), the page's folder."""
+def run_page(
+    report: RunReport,
+    folder: Path | None = None,
+    comparison: Comparison | None = None,
+    *,
+    list_link: str | None = None,
+) -> str:
+    """Return the page; links to files are relative to `folder` (default: the current one), the page's folder.
+
+    `list_link` is the address of the list of runs of a web server, which has no links to files.
+    """
     several = len(report.recordings) > 1
     started = min((one.started_at for one in report.recordings), default=None)
     expectations = contract_summaries(report.recordings)
     return render(
         "run.html",
         report=report,
-        verdict=_verdict(report.recordings),
+        list_link=list_link,
+        verdict=verdict_of(report.recordings),
         problems=run_problems(report),
         expectations=expectations[:MAX_RESULTS],
         expectation_count=len(expectations),
@@ -59,20 +69,23 @@ def run_page(report: RunReport, folder: Path | None = None, comparison: Comparis
         steps=_steps(report),
         writer_s=sum(one.steps.write for one in report.recordings),
         slowest=_slowest(report) if several else [],
-        recordings=_list_recordings(report, folder or Path()),
+        recordings=_list_recordings(report, None if list_link else folder or Path()),
     )
 
 
-class _Verdict(Struct, frozen=True):
+class Verdict(Struct, frozen=True):
+    """The outcome of a run in one sentence."""
+
     kind: str
     """The class of its color: `good`, `warn`, `bad` or `none`."""
     title: str
     text: str
 
 
-def _verdict(recordings: Sequence[Report]) -> _Verdict:
+def verdict_of(recordings: Sequence[Report]) -> Verdict:
+    """Return the gravest outcome of the recordings, with their numbers."""
     if not recordings:
-        return _Verdict("none", "No recording was ingested", "The job selected no recording.")
+        return Verdict("none", "No recording was ingested", "The job selected no recording.")
     failed = sum(one.status in FAILED for one in recordings)
     violations = sum(one.contract is not None and not one.contract.passed for one in recordings)
     incomplete = sum(one.status is RunStatus.WITH_ERRORS for one in recordings)
@@ -90,15 +103,15 @@ def _verdict(recordings: Sequence[Report]) -> _Verdict:
     )
     if failed:
         title = "The run failed" if failed == len(recordings) else "The run failed for some recordings"
-        return _Verdict("bad", title, text)
+        return Verdict("bad", title, text)
     if violations:
         is_tolerated = all(one.contract is None or one.contract.on_failure == "warn" for one in recordings)
-        return _Verdict("warn" if is_tolerated else "bad", "The data violate the contract", text)
+        return Verdict("warn" if is_tolerated else "bad", "The data violate the contract", text)
     if incomplete:
-        return _Verdict("warn", "Some messages are missing", text)
+        return Verdict("warn", "Some messages are missing", text)
     if skipped == len(recordings):
-        return _Verdict("none", "Everything was already stored", text)
-    return _Verdict("good", "Everything was stored", text)
+        return Verdict("none", "Everything was already stored", text)
+    return Verdict("good", "Everything was stored", text)
 
 
 def _totals(report: RunReport) -> dict[str, str]:
@@ -140,7 +153,7 @@ class _List(Struct, frozen=True):
     """The contents of elements that are not in them, by id of the pack."""
 
 
-def _list_recordings(report: RunReport, folder: Path) -> _List:
+def _list_recordings(report: RunReport, folder: Path | None) -> _List:
     """Return the list with problems first. Contents are rendered together and compressed, beyond the first ones."""
     views = [RecordingView(at, report, folder) for at in range(len(report.recordings))]
     views.sort(key=lambda view: -view.rank)

@@ -41,14 +41,22 @@ MAX_TOPICS = 300
 _Value = TypeVar("_Value")
 
 
-def sequence_page(store: Store, name: str, *, list_link: str | None = None) -> str:
-    """Return the page of a sequence; `list_link` is the address of the list of sequences, if there is one.
+def sequence_page(
+    store: Store, name: str, *, list_link: str | None = None, runs_link: str | None = None
+) -> str:
+    """Return the page of a sequence; a web server passes the addresses of its lists of sequences and of runs.
 
     Raises:
         SinkError: The sequence does not exist. Topics that cannot be read are described as problems on the page.
     """
     info = store.sequence(name)
-    return render("sequence.html", has_plots=True, **_Content(store, info).values(), list_link=list_link)
+    return render(
+        "sequence.html",
+        has_plots=True,
+        **_Content(store, info).values(),
+        list_link=list_link,
+        runs_link=runs_link,
+    )
 
 
 class _TopicView(Struct, frozen=True):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import http.client
+import os
 import re
 import threading
 from collections.abc import Iterator
@@ -13,12 +14,13 @@ from urllib.parse import quote
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from run_reports import Outline
-from stored_sequences import T0, TEXT, write_sequence
+from run_reports import Outline, recording, run
+from stored_sequences import NASTY, T0, TEXT, write_sequence
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.pages.browser import PAGE_SIZE, BrowserServer, StoreBrowser, name_glob
+from mosaico_ingest.report.events import RunStatus
 
 
 @pytest.fixture(scope="module")
@@ -94,6 +96,8 @@ def test_browse_localhost_is_accepted(server: BrowserServer) -> None:
         "/sequence/",
         "/sequence/%00",
         "/sequence/%ff",
+        "/run/..%2f..%2fetc%2fpasswd",
+        "/run/",
         "//etc/passwd",
     ],
 )
@@ -144,6 +148,60 @@ def test_browse_page_is_computed_again_after_the_sequence_changed(tmp_path: Path
     assert browser.page("/sequence/drive").html is first
     store.add_note("drive", "the brake was defective")
     assert "the brake was defective" in browser.page("/sequence/drive").html
+
+
+@pytest.fixture
+def runs(tmp_path: Path) -> StoreBrowser:
+    """The pages of an empty store with a failed run of Monday, a run of Tuesday, and a damaged file."""
+    store = Store.open(tmp_path / "store")
+    folder = tmp_path / "store" / "runs"
+    folder.mkdir()
+    reports = {"monday": run(recording(1, RunStatus.FAILED)), "tuesday": run(recording(2), recording(3))}
+    for at, (name, report) in enumerate(reports.items()):
+        file = folder / f"{name}.json"
+        file.write_text(report.model_dump_json())
+        os.utime(file, ns=(at, at))
+    (folder / "damaged.json").write_text(NASTY)
+    return StoreBrowser(str(store.path))
+
+
+def test_browse_lists_runs_newest_first_with_their_pages_and_sequences(runs: StoreBrowser) -> None:
+    html = runs.page("/runs").html
+    links = Outline(html).links
+    assert [link for link in links if link.startswith("/run/")] == ["/run/tuesday", "/run/monday"]
+    assert f"/sequence/{recording(3).sequence}" in links
+    assert "The run failed" in html
+    assert "damaged.json: is not a report" in html
+    assert NASTY not in html
+    page = runs.page("/run/monday")
+    assert page.status == 200
+    assert "The run failed" in page.html
+    assert "/runs" in Outline(page.html).links
+
+
+def test_browse_search_selects_runs_by_sequence(runs: StoreBrowser) -> None:
+    links = Outline(runs.page(f"/runs?q={recording(1).sequence.upper()}").html).links
+    assert [link for link in links if link.startswith("/run/")] == ["/run/monday"]
+
+
+def test_browse_run_is_read_again_after_its_report_changed(runs: StoreBrowser, tmp_path: Path) -> None:
+    first = runs.page("/run/monday").html
+    assert runs.page("/run/monday").html is first
+    file = tmp_path / "store" / "runs" / "monday.json"
+    file.write_text(run(recording(1)).model_dump_json())
+    assert "Everything was stored" in runs.page("/run/monday").html
+    assert "The run failed" not in runs.page("/runs").html
+
+
+def test_browse_damaged_report_states_the_reason(runs: StoreBrowser) -> None:
+    page = runs.page("/run/damaged")
+    assert page.status == 503
+    assert "is not a report" in page.html
+
+
+def test_browse_lists_runs_of_another_folder(store: Store, tmp_path: Path) -> None:
+    (tmp_path / "night.json").write_text(run(recording(1)).model_dump_json())
+    assert "/run/night" in Outline(StoreBrowser(str(store.path), tmp_path).page("/runs").html).links
 
 
 def test_browse_missing_store_is_an_error(tmp_path: Path) -> None:
