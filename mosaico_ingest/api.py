@@ -16,6 +16,8 @@ from itertools import groupby
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from msgspec import structs
+
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.executors.base import choose_executor
 from mosaico_ingest.findings import Finding, Severity
@@ -130,12 +132,14 @@ def compile_recording(manifest: Path, recording: AnyPath) -> tuple[Job, ...]:
     from mosaico_ingest.pipeline.compile import compile_manifests
 
     manifests = tuple(loaded.for_recording(recording.resolve()) for loaded in load_manifests(manifest))
-    return tuple(
-        job.replace(sequence=job.sequence.replace(if_exists=IfExists.SKIP))
-        if job.sequence.if_exists is IfExists.FAIL
-        else job
-        for job in compile_manifests(manifests)
-    )
+    return tuple(map(_skipping, compile_manifests(manifests)))
+
+
+def _skipping(job: Job) -> Job:
+    """Return a job that compares an existing sequence with the recording instead of failing."""
+    if job.sequence.if_exists is not IfExists.FAIL:
+        return job
+    return job.replace(sequence=job.sequence.replace(if_exists=IfExists.SKIP))
 
 
 def quick_config(
@@ -297,6 +301,8 @@ def run(
     observe: BatchObserver = ignore_batch,
     manifests: Sequence[UsedManifest] = (),
     verify: bool = False,
+    report: Path | None = None,
+    resume: bool = False,
 ) -> RunReport:
     """Run a manifest, or every job of a list, and return the report; a failed recording is part of the report.
 
@@ -304,9 +310,15 @@ def run(
     the report for its readers; a manifest that is run is added by itself. With `if_exists: skip`, stored recordings whose
     files and job have not changed are not opened; `verify` opens them and compares their content.
 
+    `report` is a file in JSON Lines (`.jsonl`) to which each recording is appended when it ends. The recordings of the
+    result are then read from this file at each access, so that their number does not determine the memory. With `resume`,
+    the run continues the report of an earlier run: recordings that it finished and that have not changed are skipped and
+    keep their lines. Sequences that exist are compared, as with `if_exists: skip`, instead of failing.
+
     Raises:
-        ManifestError: The manifest has mistakes.
+        ManifestError: The manifest has mistakes, or the file to continue is not a report.
         NothingMatched: The manifest matches no recording.
+        SinkError: The report cannot be written.
     """
     if isinstance(jobs, str | Path):
         manifests = (*manifests, used_manifest(Path(jobs)))
@@ -318,12 +330,20 @@ def run(
         tasks = LazySequence.of(add_group_results(tasks))
     from mosaico_ingest.pipeline.known import mark_known
 
-    executor = executor or choose_executor(tasks)
-    return RunReport(
-        tool=f"mosaico-ingest {__version__}",
-        manifests=tuple(manifests),
-        recordings=tuple(executor.map(tasks if verify else mark_known(tasks), observe)),
-    )
+    chosen = executor or choose_executor(tasks)
+    tool = f"mosaico-ingest {__version__}"
+    if report is None:
+        recordings = tuple(chosen.map(tasks if verify else mark_known(tasks), observe))
+        return RunReport(tool=tool, manifests=tuple(manifests), recordings=recordings)
+    from mosaico_ingest.report.files import Header, ReportWriter
+
+    with ReportWriter(report, Header(tool=tool, manifests=tuple(manifests)), resume=resume) as writer:
+        if resume:
+            tasks = tasks.map(_skipping_task)
+        marked = tasks if verify else mark_known(tasks, writer.has_finished)
+        for recording in chosen.map(marked, observe):
+            writer.add(recording)
+        return writer.finish()
 
 
 def _tasks(jobs: Sequence[Job | Task | ROSInjectionConfig]) -> LazySequence[Task]:
@@ -345,6 +365,10 @@ def _parts_of(job: Job | Task | ROSInjectionConfig) -> Iterator[Task]:
 def _task(job: Job | Task | ROSInjectionConfig) -> Task:
     (task,) = _parts_of(job)
     return task
+
+
+def _skipping_task(task: Task) -> Task:
+    return structs.replace(task, job=_skipping(task.job))
 
 
 def _parts(job: Job) -> tuple[Job, ...]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from msgspec import Struct
@@ -12,7 +12,6 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.lint.formats import Case, Suite, junit_text, sarif_text
 from mosaico_ingest.pipeline.plan_document import RecordingPlan
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
-from mosaico_ingest.report.events import RunFinished
 from mosaico_ingest.report.model import RunReport
 
 
@@ -74,13 +73,17 @@ def _other_findings(recording: CheckedRecording) -> Iterable[Finding]:
     return [Finding("run-failed", Severity.ERROR, recording.error)]
 
 
-def run_outcomes(report: RunReport, ends: Mapping[int, RunFinished]) -> list[CheckedRecording]:
-    """Return the outcome of each recording of a run; `ends` has the last event of each recording by position."""
-    outcomes: list[CheckedRecording] = []
-    for position, recording in enumerate(report.recordings):
-        findings = ends[position].findings if position in ends else ()
-        outcomes.append(CheckedRecording(recording.sequence, recording.contract, recording.error, findings))
-    return outcomes
+def run_outcomes(report: RunReport) -> list[CheckedRecording]:
+    """Return the outcome of each recording of a run."""
+    return [
+        CheckedRecording(
+            recording.sequence,
+            recording.contract,
+            recording.error,
+            tuple(each.finding for each in recording.error_findings),
+        )
+        for recording in report.recordings
+    ]
 
 
 def plan_outcomes(recordings: Sequence[RecordingPlan]) -> list[CheckedRecording]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Annotated
 
@@ -81,7 +82,11 @@ VerifyOption = Annotated[
 ]
 ReportOption = Annotated[
     Path | None,
-    typer.Option("--report", metavar="FILE", help="Write the report as JSON; - writes it to stdout."),
+    typer.Option(
+        "--report",
+        metavar="FILE",
+        help="Write the report as JSON, or as JSON Lines during the run (FILE.jsonl); - writes JSON to stdout.",
+    ),
 ]
 
 JunitOption = Annotated[
@@ -100,7 +105,7 @@ SarifOption = Annotated[
 ]
 
 
-def write_output(path: Path, text: str, *, announce: bool = False) -> None:
+def write_output(path: Path, text: str | Iterable[str], *, announce: bool = False) -> None:
     """Write the text of an output option: to a file, or to standard output if the path is `-`.
 
     With `announce`, print the name of the file to standard error.
@@ -111,7 +116,7 @@ def write_output(path: Path, text: str, *, announce: bool = False) -> None:
     from mosaico_ingest.textfile import write_atomically
 
     if path == STANDARD_OUTPUT:
-        sys.stdout.write(text)
+        sys.stdout.writelines([text] if isinstance(text, str) else text)
         return
     write_atomically(path, text)
     if announce:

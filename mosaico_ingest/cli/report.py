@@ -12,7 +12,7 @@ from rich.text import Text
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
 from mosaico_ingest.cli.options import DistroOption, JsonOption, RecordingArgument, write_output
 from mosaico_ingest.findings import Stage, join_names
-from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.events import SUCCESSFUL, RunStatus, TopicStatus
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,
@@ -34,6 +34,8 @@ WIDE = 100
 """Terminal columns from which all columns of a report's table fit."""
 MAX_TABLES = 3
 """Recordings above which each gets one row in a common table instead of a table of its topics."""
+MAX_ROWS = 200
+"""Recordings that the common table lists; those with problems come first if there are more."""
 MAX_NAMED_TOPICS = 3
 """Topics above which a reason of rejections names their number instead."""
 MAX_REASONS = 20
@@ -123,17 +125,12 @@ def report(
     from mosaico_ingest.cli.process import collect_garbage_as_usual
     from mosaico_ingest.pages.run import run_page
     from mosaico_ingest.report.compare import compare_reports
+    from mosaico_ingest.report.files import combine, read_report
     from mosaico_ingest.report.markdown import markdown_summary
-    from mosaico_ingest.report.model import read_report
 
     collect_garbage_as_usual()
     reports = [read_report(path) for path in paths]
-    combined = reports[0].model_copy(
-        update={
-            "manifests": tuple(dict.fromkeys(manifest for one in reports for manifest in one.manifests)),
-            "recordings": tuple(recording for one in reports for recording in one.recordings),
-        }
-    )
+    combined = combine(reports)
     comparison = compare_reports(combined, read_report(compare)) if compare is not None else None
     if html is not None:
         write_output(html, run_page(combined, html.parent, comparison), announce=True)
@@ -173,7 +170,20 @@ def _print_batch(report: RunReport, *, stderr: bool) -> None:
     names = ("sequence", "status", "topics", "read", "written", "rejected", "stored", "time")
     table = PlainTable(*names, numbers=set(names[1:]))
     table.columns[1].justify = "left"
+    problems: list[Report] = []
+    others: list[Report] = []
+    reasons: list[str] = []
+    reason_count = 0
     for recording in report.recordings:
+        group = others if recording.exit_code == 0 else problems
+        if len(group) < MAX_ROWS:
+            group.append(recording)
+        for reason in rejection_lines(recording):
+            reason_count += 1
+            if reason_count <= MAX_REASONS:
+                reasons.append(f"{recording.sequence}: {reason}")
+    is_complete = len(report.recordings) <= MAX_ROWS
+    for recording in report.recordings if is_complete else (problems + others)[:MAX_ROWS]:
         totals = recording.totals
         table.add_row(
             recording.sequence,
@@ -186,17 +196,15 @@ def _print_batch(report: RunReport, *, stderr: bool) -> None:
             seconds_text(recording.duration_s),
         )
     Terminal(stderr=stderr).print(table)
-    reasons = [
-        f"{recording.sequence}: {reason}"
-        for recording in report.recordings
-        for reason in rejection_lines(recording)
-    ]
-    for reason in reasons[:MAX_REASONS]:
+    if not is_complete:
+        more = counted(len(report.recordings) - MAX_ROWS, "more recording")
+        print_line(f"… and {more}; --report FILE writes all of them", stderr=stderr)
+    for reason in reasons:
         print_line(reason, style="yellow", stderr=stderr)
-    if len(reasons) > MAX_REASONS:
-        more = counted(len(reasons) - MAX_REASONS, "more reason")
+    if reason_count > MAX_REASONS:
+        more = counted(reason_count - MAX_REASONS, "more reason")
         print_line(f"… and {more}; --report FILE writes all of them", style="yellow", stderr=stderr)
-    print_line(report.headline, style="green" if report.exit_code in {0, 4} else "red", stderr=stderr)
+    print_line(report.headline, style="green" if report.exit_code in SUCCESSFUL else "red", stderr=stderr)
 
 
 def _print_recording(report: Report, *, stderr: bool) -> None:

@@ -10,9 +10,11 @@ from enum import Enum
 from functools import partial
 from operator import methodcaller
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
+from msgspec import Struct
 
 from mosaico_ingest.cli.logs import LogFormat, set_up_logging
 from mosaico_ingest.cli.options import (
@@ -33,10 +35,10 @@ from mosaico_ingest.cli.options import (
     write_output,
 )
 from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
-from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.lazy import LazySequence, concatenate
-from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, ignore_batch
+from mosaico_ingest.report.events import SUCCESSFUL, BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
@@ -46,8 +48,10 @@ if TYPE_CHECKING:
 
 T = TypeVar("T")
 
-SUCCESSFUL = {0, 4}
-"""Exit codes of runs that wrote every message that could be written."""
+MAX_ERRORS = 100
+"""Errors printed for a batch."""
+MAX_REPORTS = 1000
+"""Recordings above which their reports are kept in a file instead of in memory."""
 REPLAY_NOTES = {
     "STORED": "its messages are already in the sequence",
     "ORPHANED": "the sequence does not contain the run that quarantined it; ingest the recording again",
@@ -62,15 +66,12 @@ class ExecutorName(str, Enum):
     RAY = "ray"
 
 
-@dataclass(slots=True)
-class _ResultFiles:
+class _ResultFiles(Struct, frozen=True):
     """The files of `--metrics`, `--junit` and `--sarif`."""
 
     metrics: Path | None
     junit: Path | None
     sarif: Path | None
-    _ends: dict[int, RunFinished] = field(default_factory=dict[int, RunFinished])
-    """The last event of each recording, by position."""
 
     def check(self) -> None:
         """Raise ManifestError if one of the paths is a folder."""
@@ -79,16 +80,6 @@ class _ResultFiles:
         for file in (self.metrics, self.junit, self.sarif):
             if file is not None and file != STANDARD_OUTPUT:
                 check_output_file(file)
-
-    def observing(self, observe: BatchObserver) -> BatchObserver:
-        """Return an observer that also keeps what the files need."""
-
-        def observe_end(position: int, event: Event) -> None:
-            if isinstance(event, RunFinished):
-                self._ends[position] = event
-            observe(position, event)
-
-        return observe_end
 
     def write(self, report: RunReport) -> None:
         """Write the files."""
@@ -99,7 +90,7 @@ class _ResultFiles:
         if self.junit is not None or self.sarif is not None:
             from mosaico_ingest.cli.ci import run_outcomes, write_ci_files
 
-            write_ci_files(run_outcomes(report, self._ends), junit=self.junit, sarif=self.sarif)
+            write_ci_files(run_outcomes(report), junit=self.junit, sarif=self.sarif)
 
 
 def run(
@@ -142,6 +133,13 @@ def run(
         ),
     ] = None,
     report: ReportOption = None,
+    resume: Annotated[
+        bool,
+        typer.Option(
+            "--resume",
+            help="Continue the report of an interrupted run (FILE.jsonl): skip what it finished, and try the rest again.",
+        ),
+    ] = False,
     metrics: Annotated[
         Path | None,
         typer.Option(
@@ -201,9 +199,10 @@ def run(
             executor=on_ray,
             log_format=log_format,
             manifests=used_manifests,
-            observe=files.observing(telemetry),
+            observe=telemetry,
             on_finish=files.write,
             verify=verify,
+            resume=resume,
         )
 
 
@@ -353,6 +352,7 @@ def run_tasks(
     observe: BatchObserver = ignore_batch,
     on_finish: Callable[[RunReport], None] = lambda _report: None,
     verify: bool = False,
+    resume: bool = False,
 ) -> None:
     """Run the tasks with a progress display, write reports, print the result, and exit with its code.
 
@@ -379,33 +379,86 @@ def run_tasks(
     }
     for file in report_files - {STANDARD_OUTPUT}:
         check_output_file(file)
-    failures: list[RunFinished] = []
+    errors = _Errors()
 
-    with _display(batch, as_json=as_json, quiet=quiet) as show:
+    def observe_all(position: int, event: Event) -> None:
+        errors(event)
+        observe(position, event)
+        show(position, event)
 
-        def observe_all(position: int, event: Event) -> None:
-            if isinstance(event, RunFinished) and event.error is not None:
-                failures.append(event)
-            observe(position, event)
-            show(position, event)
+    with _streamed_report(report_files, len(batch), resume=resume) as stream:
+        with _display(batch, as_json=as_json, quiet=quiet) as show:
+            result = api.run(
+                batch,
+                executor=executor or choose_executor(batch, simultaneous=jobs, prepare=prepare),
+                observe=observe_all,
+                manifests=manifests,
+                verify=verify,
+                report=stream,
+                resume=resume,
+            )
+        write_errors = list(_write_results(result, report_files - {stream}, on_finish))
+        if not quiet and not as_json:
+            from mosaico_ingest.cli.report import print_report
 
-        chosen = executor or choose_executor(batch, simultaneous=jobs, prepare=prepare)
-        result = api.run(batch, executor=chosen, observe=observe_all, manifests=manifests, verify=verify)
-    write_errors = list(_write_results(result, report_files, on_finish))
-    if not quiet and not as_json:
-        from mosaico_ingest.cli.report import print_report
-
-        print_report(result, stderr=STANDARD_OUTPUT in report_files)
-    errors = [] if as_json else [(failure.error or "", failure.findings) for failure in failures]
-    errors += [(str(error), error.findings) for error in write_errors]
-    if errors:
-        from mosaico_ingest.cli.console import print_error
-
-        for error, findings in errors:
-            print_error(error, findings)
+            print_report(result, stderr=STANDARD_OUTPUT in report_files)
+    if as_json:
+        errors = _Errors()
+    errors.print(write_errors)
     code = SinkError.exit_code if write_errors and result.exit_code in SUCCESSFUL else result.exit_code
     if code:
         raise typer.Exit(code)
+
+
+@dataclass(slots=True)
+class _Errors:
+    """The errors of failed recordings."""
+
+    first: list[RunFinished] = field(default_factory=list[RunFinished])
+    """The first `MAX_ERRORS` of them."""
+    count: int = 0
+
+    def __call__(self, event: Event) -> None:
+        """Add the error of a recording."""
+        if isinstance(event, RunFinished) and event.error is not None:
+            self.count += 1
+            if self.count <= MAX_ERRORS:
+                self.first.append(event)
+
+    def print(self, others: Sequence[IngestError]) -> None:
+        """Print these errors and others."""
+        if not self.count and not others:
+            return
+        from mosaico_ingest.cli.console import print_error, print_line
+
+        for failure in self.first:
+            print_error(failure.error or "", failure.findings)
+        if self.count > MAX_ERRORS:
+            line = f"… and {self.count - MAX_ERRORS:,} more errors; --report FILE writes all of them"
+            print_line(line, stderr=True)
+        for error in others:
+            print_error(str(error), error.findings)
+
+
+@contextmanager
+def _streamed_report(files: set[Path], recordings: int, *, resume: bool) -> Generator[Path | None]:
+    """Yield the file to which each recording is appended when it ends: a report file, or a temporary one for many recordings.
+
+    Raises:
+        typer.BadParameter: The report of an earlier run cannot be continued, because no report file is in JSON Lines.
+    """
+    from mosaico_ingest.report.files import LINES_SUFFIX
+
+    streamed = next((file for file in sorted(files) if file.suffix == LINES_SUFFIX), None)
+    if resume and streamed is None:
+        raise typer.BadParameter(
+            f"needs a report in JSON Lines: --report FILE{LINES_SUFFIX}", param_hint="--resume"
+        )
+    if streamed is not None or recordings <= MAX_REPORTS:
+        yield streamed
+        return
+    with TemporaryDirectory(prefix="ingest-report-") as folder:
+        yield Path(folder) / f"report{LINES_SUFFIX}"
 
 
 def _display(
@@ -424,8 +477,12 @@ def _write_results(
     result: RunReport, report_files: set[Path], on_finish: Callable[[RunReport], None]
 ) -> Iterator[SinkError]:
     """Call `on_finish` and write the report files; yield the errors."""
-    text = result.model_dump_json(indent=2) + "\n"
-    for write in (partial(on_finish, result), *(partial(write_output, file, text) for file in report_files)):
+    from mosaico_ingest.report.files import report_text
+
+    def write_report(file: Path) -> None:
+        write_output(file, report_text(result, file))
+
+    for write in (partial(on_finish, result), *(partial(write_report, file) for file in report_files)):
         try:
             write()
         except SinkError as error:  # noqa: PERF203 - a file that cannot be written must not affect the others

@@ -91,15 +91,7 @@ class Clause(Struct, frozen=True):
             outcome=outcome,
             text=one_line(text),
             topic=self.topic,
-            location=None
-            if span is None
-            else Location(
-                file=span.file,
-                line=span.line,
-                column=span.column,
-                end_line=span.end_line,
-                end_column=span.end_column,
-            ),
+            location=None if span is None else Location.of(span),
             **details,
         )
 

@@ -17,7 +17,7 @@ from mosaico_ingest.pages.recording import (
     contract_summaries,
     step_shares,
 )
-from mosaico_ingest.report.collect import slowest, total_seconds
+from mosaico_ingest.report.collect import slowest, step_seconds
 from mosaico_ingest.report.compare import Comparison
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.model import Report, RunReport
@@ -53,7 +53,7 @@ def run_page(
     `list_link` is the address of the list of runs of a web server, which has no links to files.
     """
     several = len(report.recordings) > 1
-    started = min((one.started_at for one in report.recordings), default=None)
+    started = report.summary.started_at
     expectations = contract_summaries(report.recordings)
     return render(
         "run.html",
@@ -67,7 +67,7 @@ def run_page(
         started_at=f"{started:%Y-%m-%d %H:%M:%S}" if started else None,
         totals=_totals(report),
         steps=_steps(report),
-        writer_s=sum(one.steps.write for one in report.recordings),
+        writer_s=report.summary.steps.write,
         slowest=_slowest(report) if several else [],
         recordings=_list_recordings(report, None if list_link else folder or Path()),
     )
@@ -115,17 +115,15 @@ def verdict_of(recordings: Sequence[Report]) -> Verdict:
 
 
 def _totals(report: RunReport) -> dict[str, str]:
-    totals = [one.totals for one in report.recordings]
-    source_bytes = sum(one.source_bytes for one in report.recordings)
-    stored_bytes = sum(one.stored_bytes for one in totals)
-    seconds = sum(one.duration_s for one in report.recordings)
-    read = sum(one.read for one in totals)
+    summary = report.summary
+    source_bytes, stored_bytes = summary.source_bytes, summary.stored_bytes
+    seconds, read = summary.duration_s, summary.read
     share = f" ({percent_text(stored_bytes / source_bytes)})" if source_bytes else ""
     return {
         "Recordings": count_text(len(report.recordings)),
         "Messages read": count_text(read),
-        "Written": count_text(sum(one.written for one in totals)),
-        "Rejected": count_text(sum(one.rejected for one in totals)),
+        "Written": count_text(summary.written),
+        "Rejected": count_text(summary.rejected),
         "Unreadable": unreadable_text(report.recordings),
         "Recorded": bytes_text(source_bytes),
         "Stored": f"{bytes_text(stored_bytes)}{share}",
@@ -135,7 +133,7 @@ def _totals(report: RunReport) -> dict[str, str]:
 
 
 def _steps(report: RunReport) -> list[StepShare]:
-    return step_shares(total_seconds(report.recordings), stacked=False)
+    return step_shares(step_seconds(report.summary.steps), stacked=False)
 
 
 def _slowest(report: RunReport) -> list[RecordingView]:

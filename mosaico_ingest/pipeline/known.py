@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Sequence
-from itertools import islice
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from itertools import compress, islice
 from pathlib import Path
 from typing import TypeVar
 
@@ -23,14 +23,27 @@ _FIRST_BATCH, _MAX_BATCH = 8, 256
 _T = TypeVar("_T")
 
 
-def mark_known(tasks: Iterable[Task]) -> Iterator[Task]:
-    """Yield the tasks, and mark a task as known if it has `if_exists: skip` and its recording is stored, complete and unchanged."""
+def mark_known(
+    tasks: Iterable[Task], is_finished: Callable[[str, str], bool] = lambda _sequence, _destination: False
+) -> Iterator[Task]:
+    """Yield the tasks, and mark a task as known if its recording is stored, complete and unchanged and may be skipped.
+
+    It may be skipped with `if_exists: skip`, or if `is_finished` returns True for its sequence and destination.
+    """
+
+    def may_be_skipped(task: Task) -> bool:
+        job = task.job
+        if task.plan_digest is not None or task.dry_run:
+            return False
+        return job.sequence.if_exists is IfExists.SKIP or is_finished(
+            job.sequence.name, destination_of(job.destination).describe()
+        )
+
     for batch in _batches(tasks):
-        candidates = [task for task in batch if _may_be_skipped(task)]
-        known = iter(known_recordings([task.job for task in candidates]))
-        for task in batch:
-            is_known = _may_be_skipped(task) and next(known)
-            yield structs.replace(task, known=True) if is_known else task
+        skippable = [may_be_skipped(task) for task in batch]
+        known = iter(known_recordings([task.job for task in compress(batch, skippable)]))
+        for task, is_skippable in zip(batch, skippable, strict=True):
+            yield structs.replace(task, known=True) if is_skippable and next(known) else task
 
 
 def with_known(jobs: Iterable[Job]) -> Iterator[tuple[Job, bool]]:
@@ -65,10 +78,6 @@ def _stored(jobs: Sequence[Job]) -> dict[str, ExistingSequence]:
         return destination_of(jobs[0].destination).find_all([job.sequence.name for job in jobs])
     except Exception:  # noqa: BLE001 - destinations may be of other packages, and the run of the recording reports it
         return {}
-
-
-def _may_be_skipped(task: Task) -> bool:
-    return task.job.sequence.if_exists is IfExists.SKIP and task.plan_digest is None and not task.dry_run
 
 
 def _batches(items: Iterable[_T]) -> Iterator[list[_T]]:

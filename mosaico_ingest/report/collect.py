@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mosaico_ingest.findings import Stage
@@ -26,7 +26,15 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import Rejection, Report, Steps, Stretch, TopicReport, UnreadableRange
+from mosaico_ingest.report.model import (
+    ErrorFinding,
+    Rejection,
+    Report,
+    Steps,
+    Stretch,
+    TopicReport,
+    UnreadableRange,
+)
 from mosaico_ingest.report.timing import Stopwatch
 
 STEP_WORDS = {
@@ -45,13 +53,6 @@ MAX_STRETCHES = 50
 def step_seconds(steps: Steps) -> dict[str, float]:
     """Return the seconds of each sequential step."""
     return {name: float(getattr(steps, name)) for name in STEP_WORDS}
-
-
-def total_seconds(recordings: Sequence[Report]) -> Mapping[str, float]:
-    """Return the seconds of each step over all recordings; empty if no recording was timed."""
-    timed = [step_seconds(one.steps) for one in recordings]
-    sums = {name: sum(one[name] for one in timed) for name in STEP_WORDS}
-    return sums if any(sums.values()) else {}
 
 
 def longest_step(steps: Steps) -> str:
@@ -208,6 +209,7 @@ class Collector:
             topics=tuple(self._topic(topic) for topic in self._start.topics),
             unreadable_ranges=tuple(self._unreadable),
             findings=tuple(self._findings),
+            error_findings=tuple(map(ErrorFinding.of, self._finish.findings)),
         )
 
     def _unread(self, expected: Expected) -> _Sum:

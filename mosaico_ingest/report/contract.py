@@ -36,6 +36,17 @@ class Location(ReportPart):
     end_line: int
     end_column: int
 
+    @classmethod
+    def of(cls, span: Span) -> Location:
+        """Return a span as a part of a report."""
+        return cls(
+            file=span.file,
+            line=span.line,
+            column=span.column,
+            end_line=span.end_line,
+            end_column=span.end_column,
+        )
+
     @property
     def span(self) -> Span:
         """The location as a span."""

@@ -35,6 +35,10 @@ class RunStatus(str, Enum):
     INTERRUPTED = "interrupted"
 
 
+SUCCESSFUL = frozenset({0, 4})
+"""Exit codes of recordings whose messages were written as far as possible."""
+
+
 class TopicStatus(str, Enum):
     """How one topic ended."""
 

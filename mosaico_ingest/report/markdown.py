@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 
 from mosaico_ingest.findings import Severity, one_line
-from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, total_seconds
+from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, step_seconds
 from mosaico_ingest.report.compare import Comparison
 from mosaico_ingest.report.contract import ExpectationResult, Outcome
 from mosaico_ingest.report.model import Report, RunReport, replay_command
@@ -64,10 +64,10 @@ def _row(recording: Report) -> str:
 
 def _time_lines(report: RunReport) -> list[str]:
     """Return the share of each step, and the slowest recordings if there are several."""
-    seconds = total_seconds(report.recordings)
-    if not seconds:
-        return []
+    seconds = step_seconds(report.summary.steps)
     total = sum(seconds.values())
+    if not total:
+        return []
     shares = ", ".join(f"{STEP_WORDS[name]} {percent_text(spent / total)}" for name, spent in seconds.items())
     lines = ["", f"Time: {shares}."]
     if len(report.recordings) > 1:

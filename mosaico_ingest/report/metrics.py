@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.report.contract import ContractResult, Outcome
@@ -24,17 +24,18 @@ def contract_metrics(contracts: Sequence[ContractResult]) -> str:
     return "".join(f"{line}\n" for line in _contract_lines(contracts))
 
 
-def _contract_lines(contracts: Sequence[ContractResult]) -> Iterator[str]:
+def _contract_lines(contracts: Iterable[ContractResult]) -> Iterator[str]:
     """Yield the numbers of contracts and expectations; nothing without a contract."""
-    if not contracts:
+    outcomes: Counter[bool] = Counter()
+    counts: Counter[tuple[Outcome, Severity]] = Counter()
+    for contract in contracts:
+        outcomes[contract.passed] += 1
+        counts.update((result.outcome, result.severity) for result in contract.results)
+    if not outcomes:
         return
     yield from _gauge("contracts", "Recordings of the last run by the outcome of their data contracts.")
-    passed = sum(contract.passed for contract in contracts)
-    for outcome, count in ((Outcome.PASSED, passed), (Outcome.FAILED, len(contracts) - passed)):
-        yield f'{_PREFIX}_contracts{{outcome="{outcome.value}"}} {count}'
-    counts = Counter(
-        (result.outcome, result.severity) for contract in contracts for result in contract.results
-    )
+    for outcome, passed in ((Outcome.PASSED, True), (Outcome.FAILED, False)):
+        yield f'{_PREFIX}_contracts{{outcome="{outcome.value}"}} {outcomes[passed]}'
     yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
     for outcome in Outcome:
         for severity in (Severity.ERROR, Severity.WARNING):
@@ -43,30 +44,26 @@ def _contract_lines(contracts: Sequence[ContractResult]) -> Iterator[str]:
 
 
 def _lines(report: RunReport) -> Iterator[str]:
-    states = Counter(one.status for one in report.recordings)
+    summary = report.summary
     yield from _gauge("recordings", "Recordings of the last run by status.")
-    for state in RunStatus:
-        yield f'{_PREFIX}_recordings{{status="{state.value}"}} {states[state]}'
-    totals = [one.totals for one in report.recordings]
+    for status in RunStatus:
+        yield f'{_PREFIX}_recordings{{status="{status.value}"}} {summary.statuses.get(status, 0)}'
     yield from _gauge("messages", "Messages of the last run by outcome.")
-    for fate in ("read", "written", "filtered", "downsampled", "rejected"):
-        yield f'{_PREFIX}_messages{{fate="{fate}"}} {sum(getattr(one, fate) for one in totals)}'
-    unread = sum(item.count or 0 for one in report.recordings for item in one.unreadable_ranges)
-    yield f'{_PREFIX}_messages{{fate="unreadable"}} {unread}'
-    yield from _contract_lines([one.contract for one in report.recordings if one.contract is not None])
+    for fate in ("read", "written", "filtered", "downsampled", "rejected", "unreadable"):
+        yield f'{_PREFIX}_messages{{fate="{fate}"}} {getattr(summary, fate)}'
+    yield from _contract_lines(one.contract for one in report.recordings if one.contract is not None)
     yield from _gauge(
         "step_seconds", "Time of the last run by step; the write step runs in parallel to the others."
     )
     for step in Step:
-        spent = sum(getattr(one.steps, step.value) for one in report.recordings)
-        yield f'{_PREFIX}_step_seconds{{step="{step.value}"}} {spent:.6g}'
-    ended = max((one.started_at.timestamp() + one.duration_s for one in report.recordings), default=0)
+        yield f'{_PREFIX}_step_seconds{{step="{step.value}"}} {getattr(summary.steps, step.value):.6g}'
+    ended = 0.0 if summary.ended_at is None else summary.ended_at.timestamp()
     single: tuple[tuple[str, str, float], ...] = (
-        ("source_bytes", "Size of the recordings.", sum(one.source_bytes for one in report.recordings)),
-        ("stored_bytes", "Size of the stored rows.", sum(one.stored_bytes for one in totals)),
-        ("working_seconds", "Time spent on recordings.", sum(one.duration_s for one in report.recordings)),
+        ("source_bytes", "Size of the recordings.", summary.source_bytes),
+        ("stored_bytes", "Size of the stored rows.", summary.stored_bytes),
+        ("working_seconds", "Time spent on recordings.", summary.duration_s),
         ("last_end_timestamp_seconds", "When the last recording ended, since the epoch.", ended),
-        ("exit_code", "The exit code of the run.", report.exit_code),
+        ("exit_code", "The exit code of the run.", summary.exit_code),
     )
     for name, what, value in single:
         yield from _gauge(name, what)

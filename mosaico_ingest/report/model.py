@@ -4,28 +4,29 @@ from __future__ import annotations
 
 import os
 import shlex
-from collections.abc import Mapping, Sequence
-from datetime import datetime
+from collections import Counter
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta
+from functools import cached_property
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
-import msgspec
-from pydantic import BaseModel, computed_field
+from pydantic import AfterValidator, Field, computed_field
+from typing_extensions import Self
 
-from mosaico_ingest.documents import document_schema, read_document
-from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.findings import Stage, one_line
+from mosaico_ingest.documents import document_schema
+from mosaico_ingest.findings import Finding, Severity, Stage, one_line
 from mosaico_ingest.notebook import html_table
-from mosaico_ingest.report.contract import ContractResult, ReportPart
+from mosaico_ingest.report.contract import ContractResult, Location, ReportPart
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, written_cell, written_text
 
 _GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
-
-
-_Model = TypeVar("_Model", bound=BaseModel)
+UNSUCCESSFUL = (RunStatus.FAILED, RunStatus.INTERRUPTED, RunStatus.DIVERTED)
+"""Statuses of recordings that were not stored as the job demands."""
 
 
 class Stretch(ReportPart):
@@ -175,6 +176,36 @@ class Steps(ReportPart):
     """Time that the writing thread was busy, in parallel to the other steps."""
 
 
+class ErrorFinding(ReportPart):
+    """A finding that ended the run of a recording."""
+
+    rule: str
+    severity: Severity
+    message: str
+    help: str | None = None
+    location: Location | None = None
+    """The location in the manifest or another text; None if it is unknown."""
+
+    @classmethod
+    def of(cls, finding: Finding) -> ErrorFinding:
+        """Return a finding as a part of a report."""
+        span = finding.span
+        location = None if span is None else Location.of(span)
+        return cls(
+            rule=finding.rule,
+            severity=finding.severity,
+            message=finding.message,
+            help=finding.help,
+            location=location,
+        )
+
+    @property
+    def finding(self) -> Finding:
+        """The finding."""
+        span = None if self.location is None else self.location.span
+        return Finding(self.rule, self.severity, self.message, span, self.help)
+
+
 class Report(ReportPart):
     """The result of one recording."""
 
@@ -198,6 +229,8 @@ class Report(ReportPart):
     unreadable_ranges: tuple[UnreadableRange, ...] = ()
     findings: tuple[str, ...] = ()
     """The findings of the run, one line each."""
+    error_findings: tuple[ErrorFinding, ...] = ()
+    """The findings that `error` summarizes, with their locations."""
 
     @computed_field
     @property
@@ -252,6 +285,97 @@ class UsedManifest(ReportPart):
     """The manifest as YAML, with `extends` resolved and without secrets."""
 
 
+class Summary(ReportPart):
+    """Sums over the recordings of a run."""
+
+    statuses: Mapping[RunStatus, int] = Field(default={})
+    """Number of recordings by status."""
+    read: int = 0
+    written: int = 0
+    filtered: int = 0
+    downsampled: int = 0
+    rejected: int = 0
+    unreadable: int = 0
+    """Number of unreadable messages, as far as it is known."""
+    source_bytes: int = 0
+    stored_bytes: int = 0
+    duration_s: float = 0
+    """Time spent on recordings; recordings that run at the same time add up."""
+    steps: Steps = Steps()
+    started_at: datetime | None = None
+    """The time when the first recording started; None without recordings."""
+    ended_at: datetime | None = None
+    """The time when the last recording ended."""
+    exit_code: int = 0
+    """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
+    resumed: int = 0
+    """Number of recordings that an earlier run of the report finished and that the last run did not ingest again."""
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return sum(self.statuses.values())
+
+    @property
+    def headline(self) -> str:
+        """The numbers of recordings by outcome and of written messages, in one line."""
+        failed = sum(self.statuses.get(status, 0) for status in UNSUCCESSFUL)
+        skipped = self.statuses.get(RunStatus.SKIPPED, 0)
+        parts = [counted(self.recordings, "recording"), f"{count_text(failed)} failed"]
+        parts += [f"{count_text(self.resumed)} from earlier runs"] if self.resumed else []
+        parts += [f"{count_text(skipped)} skipped"] if skipped else []
+        return f"{', '.join(parts)}, {counted(self.written, 'message')} written"
+
+
+@dataclass(slots=True)
+class RunningSummary:
+    """The sums over the recordings that have ended so far."""
+
+    _statuses: Counter[RunStatus] = field(default_factory=Counter[RunStatus])
+    _counts: Counter[str] = field(default_factory=Counter[str])
+    _seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(Steps.model_fields, 0.0))
+    _duration_s: float = 0
+    _codes: set[int] = field(default_factory=set[int])
+    _started_at: datetime | None = None
+    _ended_at: datetime | None = None
+
+    def add(self, report: Report) -> None:
+        """Add the report of a recording."""
+        totals = report.totals
+        self._statuses[report.status] += 1
+        self._codes.add(report.exit_code)
+        for name in ("read", "written", "filtered", "downsampled", "rejected", "stored_bytes"):
+            self._counts[name] += getattr(totals, name)
+        self._counts["unreadable"] += sum(item.count or 0 for item in report.unreadable_ranges)
+        self._counts["source_bytes"] += report.source_bytes
+        for name in self._seconds:
+            self._seconds[name] += getattr(report.steps, name)
+        self._duration_s += report.duration_s
+        ended_at = report.started_at + timedelta(seconds=report.duration_s)
+        self._started_at = min(self._started_at or report.started_at, report.started_at)
+        self._ended_at = max(self._ended_at or ended_at, ended_at)
+
+    def summary(self) -> Summary:
+        """Return the sums so far."""
+        return Summary(
+            statuses=dict(self._statuses),
+            **self._counts,
+            duration_s=round(self._duration_s, 6),
+            steps=Steps(**{name: round(seconds, 6) for name, seconds in self._seconds.items()}),
+            started_at=self._started_at,
+            ended_at=self._ended_at,
+            exit_code=gravest(self._codes),
+        )
+
+
+def summarize(recordings: Iterable[Report]) -> Summary:
+    """Return the sums over recordings."""
+    running = RunningSummary()
+    for recording in recordings:
+        running.add(recording)
+    return running.summary()
+
+
 class RunReport(ReportPart):
     """The report of one run, with a part for each recording; `version` changes with the format."""
 
@@ -259,17 +383,36 @@ class RunReport(ReportPart):
     tool: str
     """Name and version of the program that wrote the report."""
     manifests: tuple[UsedManifest, ...] = ()
-    recordings: tuple[Report, ...]
+    recordings: Annotated[Sequence[Report], AfterValidator(tuple)]
+    """The result of each recording. If the report is a file in JSON Lines, each access reads the recording."""
+
+    @computed_field
+    @cached_property
+    def summary(self) -> Summary:
+        """The sums over all recordings."""
+        return summarize(self.recordings)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy; the sums are computed again if the recordings differ."""
+        copy = super().model_copy(update=update, deep=deep)
+        if update is not None and "recordings" in update:
+            vars(copy).pop("summary", None)
+        return copy
+
+    def with_summary(self, summary: Summary) -> Self:
+        """Return the report with sums that were computed before."""
+        return self.model_copy(update={"summary": summary})
 
     @property
     def headline(self) -> str:
         """The numbers of recordings by outcome and of written messages, in one line."""
-        failed = sum(one.exit_code not in {0, 4} for one in self.recordings)
-        skipped = sum(one.status is RunStatus.SKIPPED for one in self.recordings)
-        written = sum(one.totals.written for one in self.recordings)
-        parts = [counted(len(self.recordings), "recording"), f"{count_text(failed)} failed"]
-        parts += [f"{count_text(skipped)} skipped"] if skipped else []
-        return f"{', '.join(parts)}, {counted(written, 'message')} written"
+        return self.summary.headline
+
+    @computed_field
+    @property
+    def exit_code(self) -> int:
+        """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
+        return self.summary.exit_code
 
     def __repr__(self) -> str:
         """Return the outcome, such as `<RunReport: 2 recordings, 0 failed, 4,220 messages written>`."""
@@ -296,12 +439,6 @@ class RunReport(ReportPart):
             self.headline, names, rows, count=len(self.recordings), numbers={"read", "written", "rejected"}
         )
 
-    @computed_field
-    @property
-    def exit_code(self) -> int:
-        """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
-        return gravest([report.exit_code for report in self.recordings])
-
 
 def _topic_table(report: Report) -> str:
     """Return the topics that were read as a table for a notebook."""
@@ -323,7 +460,7 @@ def _topic_table(report: Report) -> str:
     return html_table(repr(report)[1:-1], names, rows, count=len(topics), numbers=names[2:], notes=notes)
 
 
-def gravest(codes: Sequence[int]) -> int:
+def gravest(codes: Collection[int]) -> int:
     """Return the exit code of a run whose recordings have these exit codes."""
     return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
 
@@ -348,50 +485,3 @@ def folder_link(one: Report, page_folder: Path) -> str | None:
         return None
     folder = os.path.relpath(Path(one.quarantine).absolute().parent, page_folder.absolute())
     return quote(Path(folder).as_posix().encode("utf-8", "surrogateescape")) + "/"
-
-
-def read_report(path: Path) -> RunReport:
-    """Read a report file.
-
-    Raises:
-        ManifestError: The file does not exist or violates the schema of reports.
-    """
-    try:
-        content = path.read_bytes()
-    except OSError as error:
-        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path)) from error
-    return _parse_by_recording(content) or read_document(
-        content, RunReport, where=str(path), kind="a report", hint="write one with `ingest run --report FILE`"
-    )
-
-
-def _parse_by_recording(content: bytes) -> RunReport | None:
-    """Return the report if the model writes each of its parts byte for byte the same, apart from white space; else None.
-
-    Such a report satisfies the published schema, against which validation takes ten times as long. The recordings are
-    parsed one by one, because the objects of a complete JSON document need several times the memory of its models.
-    """
-    models = {"manifests": UsedManifest, "recordings": Report}
-    try:
-        members = msgspec.json.decode(content, type=dict[str, msgspec.Raw])
-        if not members.keys() <= {*RunReport.model_fields, *RunReport.model_computed_fields}:
-            return None
-        values = {
-            name: tuple(
-                _parse_part(part, models[name]) for part in msgspec.json.decode(raw, type=list[msgspec.Raw])
-            )
-            if name in models
-            else msgspec.json.decode(raw)
-            for name, raw in members.items()
-        }
-        report = RunReport.model_validate(values, strict=True)
-    except ValueError:  # the base class of the errors of msgspec and pydantic
-        return None
-    return report if report.exit_code == values.get("exit_code") else None
-
-
-def _parse_part(raw: msgspec.Raw, model: type[_Model]) -> _Model:
-    part = model.model_validate_json(bytes(raw))
-    if part.model_dump_json().encode() != msgspec.json.format(bytes(raw), indent=-1):
-        raise ValueError("the values differ from the values that the model writes")
-    return part

@@ -20,8 +20,9 @@ from mosaico_ingest.pages.run import MAX_OPEN, run_page
 from mosaico_ingest.report.compare import compare_reports
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Occurrence, Outcome
 from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.report.files import read_report
 from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.model import Steps, UnreadableRange, read_report
+from mosaico_ingest.report.model import Steps, UnreadableRange
 from mosaico_ingest.rosbag.loader import ROSLoader
 from mosaico_ingest.view.values import value_text
 

@@ -8,7 +8,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.report.model import read_report
+from mosaico_ingest.report.files import read_report
 from mosaico_ingest.report.timing import Step, Stopwatch
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"

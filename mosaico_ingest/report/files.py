@@ -1,0 +1,323 @@
+"""Report files: JSON documents, and JSON Lines to which a run appends each recording when it ends.
+
+A file in JSON Lines has a header, a line for each recording, and a summary. The lines of several runs follow each other if
+a run continues the report of an interrupted one; a recording then has the line of the last run that reported it.
+"""
+
+from __future__ import annotations
+
+import os
+from array import array
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from pathlib import Path
+from textwrap import indent
+from typing import IO, Literal, TypeVar
+
+import msgspec
+from pydantic import BaseModel, ValidationError
+from typing_extensions import Self
+
+from mosaico_ingest.documents import read_document
+from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.lazy import LazySequence, concatenate
+from mosaico_ingest.report.contract import ReportPart
+from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
+from mosaico_ingest.report.model import Report, RunningSummary, RunReport, Summary, UsedManifest, summarize
+
+LINES_SUFFIX = ".jsonl"
+"""The suffix of report files in JSON Lines."""
+_HINT = "write one with `ingest run --report FILE`"
+_NO_RECORDINGS = '"recordings": []'
+_Model = TypeVar("_Model", bound=BaseModel)
+
+
+class Header(ReportPart):
+    """The first line of a run."""
+
+    version: Literal[1] = 1
+    tool: str
+    """Name and version of the program that wrote the lines."""
+    manifests: tuple[UsedManifest, ...] = ()
+
+
+class Footer(ReportPart):
+    """The last line of a run; it is missing if the run was killed."""
+
+    summary: Summary
+    """The sums over all recordings of the file."""
+
+
+class _Line(msgspec.Struct):
+    """The values of a line that the index needs."""
+
+    tool: str | None = None
+    sequence: str | None = None
+    destination: str = ""
+    exit_code: int = 0
+
+
+class _Index:
+    """The positions of the recordings of a file in JSON Lines, which takes 24 bytes for each."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.end = 0
+        """The offset behind the last complete line."""
+        self.summary: Summary | None = None
+        """The sums over all recordings, if the last run was not killed."""
+        self._tool = ""
+        self._manifests: dict[UsedManifest, None] = {}
+        self._runs: list[int] = []
+        """The position of the first recording of each run."""
+        self._offsets, self._keys, self._codes = array("q"), array("q"), array("q")
+
+    def read(self, file: IO[bytes]) -> Self:
+        """Add the lines of a file, except a last one that is incomplete.
+
+        Raises:
+            ManifestError: The file is not a report in JSON Lines.
+        """
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                entry = msgspec.json.decode(line, type=_Line)
+            except msgspec.MsgspecError as error:
+                raise ManifestError(
+                    f"is not a report: line {number}: {error}", where=str(self.path), hint=_HINT
+                ) from error
+            if entry.tool is not None or not self._runs:
+                self.add_header(self._parse(line, Header, f"line {number}"))
+            elif entry.sequence is not None:
+                self.add(entry.sequence, entry.destination, entry.exit_code)
+            else:
+                self.summary = self._parse(line, Footer, f"line {number}").summary
+            self.end += len(line)
+        return self
+
+    def add_header(self, header: Header) -> None:
+        """Add a run whose header is at `end`."""
+        self.summary = None
+        self._tool = header.tool
+        self._manifests.update(dict.fromkeys(header.manifests))
+        self._runs.append(len(self._offsets))
+
+    def add(self, sequence: str, destination: str, exit_code: int) -> None:
+        """Add a recording whose line is at `end`."""
+        self._offsets.append(self.end)
+        self._keys.append(_key(sequence, destination))
+        self._codes.append(exit_code)
+
+    @property
+    def finished(self) -> set[int]:
+        """The keys of the recordings that were written."""
+        return {self._keys[position] for position in self._latest() if self._codes[position] in SUCCESSFUL}
+
+    @property
+    def resumed(self) -> int:
+        """Number of recordings whose line is of an earlier run than the last one."""
+        return sum(position < self._runs[-1] for position in self._latest()) if len(self._runs) > 1 else 0
+
+    def report(self) -> RunReport:
+        """Return the report of all runs; each recording is read at each access."""
+        latest = self._latest()
+        report = RunReport.model_construct(
+            tool=self._tool,
+            manifests=tuple(self._manifests),
+            recordings=LazySequence(lambda at: self._recording(latest[at]), range(len(latest)), ()),
+        )
+        return report if self.summary is None else report.with_summary(self.summary)
+
+    def _latest(self) -> Sequence[int]:
+        """Return the positions of recordings without those that a later run reported again."""
+        if len(self._runs) <= 1:
+            return range(len(self._offsets))
+        later: set[int] = set()
+        positions: list[int] = []
+        for start, end in reversed(list(zip(self._runs, [*self._runs[1:], len(self._offsets)], strict=True))):
+            positions += [at for at in reversed(range(start, end)) if self._keys[at] not in later]
+            later.update(self._keys[start:end])
+        return array("q", reversed(positions))
+
+    def _recording(self, position: int) -> Report:
+        offset = self._offsets[position]
+        try:
+            with self.path.open("rb") as file:
+                file.seek(offset)
+                line = file.readline()
+        except OSError as error:
+            raise ManifestError(f"cannot be read: {error.strerror}", where=str(self.path)) from error
+        return self._parse(line, Report, f"byte {offset}")
+
+    def _parse(self, line: bytes, model: type[_Model], position: str) -> _Model:
+        try:
+            return model.model_validate_json(line)
+        except ValidationError:
+            where = f"{self.path}: {position}"
+            return read_document(line, model, where=where, kind="a report", hint=_HINT)
+
+
+class ReportWriter:
+    """Appends the recordings of a run to a file in JSON Lines.
+
+    With `resume`, the lines of earlier runs in the file are kept. A recording that they finished and that this run skips
+    gets no other line.
+
+    Raises:
+        ManifestError: The path has another suffix, or the file to continue is not a report.
+        SinkError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path, header: Header, *, resume: bool = False) -> None:
+        if path.suffix != LINES_SUFFIX:
+            raise ManifestError(
+                f"the suffix of a report in JSON Lines is {LINES_SUFFIX}", where=str(path), hint="rename it"
+            )
+        self._index = _Index(path)
+        self._summary = RunningSummary()
+        self._finished: set[int] = set()
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            if resume and path.is_file():
+                with path.open("rb") as file:
+                    self._finished = self._index.read(file).finished
+                os.truncate(path, self._index.end)  # removes a line that a killed run did not complete
+            self._file = path.open("ab" if resume else "wb")
+        except OSError as error:
+            raise self._unwritable(error) from error
+        self._index.add_header(header)
+        self._append(header)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._file.close()
+
+    def has_finished(self, sequence: str, destination: str) -> bool:
+        """Return whether an earlier run of the file finished a recording."""
+        return _key(sequence, destination) in self._finished
+
+    def add(self, report: Report) -> None:
+        """Append the report of a recording.
+
+        Raises:
+            SinkError: The file cannot be written.
+        """
+        if report.status is RunStatus.SKIPPED and self.has_finished(report.sequence, report.destination):
+            return
+        self._index.add(report.sequence, report.destination, report.exit_code)
+        self._append(report)
+        self._summary.add(report)
+
+    def finish(self) -> RunReport:
+        """Append the summary and return the report; each of its recordings is read from the file at each access.
+
+        Raises:
+            SinkError: The file cannot be written.
+        """
+        resumed = self._index.resumed
+        summary = summarize(self._index.report().recordings) if resumed else self._summary.summary()
+        summary = summary.replace(resumed=resumed)
+        self._append(Footer(summary=summary))
+        self._index.summary = summary
+        return self._index.report()
+
+    def _append(self, part: ReportPart) -> None:
+        line = part.model_dump_json().encode() + b"\n"
+        try:
+            self._file.write(line)
+            self._file.flush()
+        except OSError as error:
+            with suppress(OSError):  # closing flushes, too
+                self._file.close()
+            raise self._unwritable(error) from error
+        self._index.end += len(line)
+
+    def _unwritable(self, error: OSError) -> SinkError:
+        return SinkError(f"cannot be written: {error.strerror}", where=str(self._index.path))
+
+
+def read_report(path: Path) -> RunReport:
+    """Read a report file; the recordings of a file in JSON Lines are read at each access.
+
+    Raises:
+        ManifestError: The file does not exist or violates the schema of reports.
+    """
+    try:
+        if path.suffix == LINES_SUFFIX:
+            with path.open("rb") as file:
+                return _Index(path).read(file).report()
+        content = path.read_bytes()
+    except OSError as error:
+        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path)) from error
+    return _parse_by_recording(content) or read_document(
+        content, RunReport, where=str(path), kind="a report", hint=_HINT
+    )
+
+
+def combine(reports: Sequence[RunReport]) -> RunReport:
+    """Return one report with the manifests and recordings of several."""
+    if len(reports) == 1:
+        return reports[0]
+    return RunReport.model_construct(
+        tool=reports[0].tool,
+        manifests=tuple(dict.fromkeys(used for one in reports for used in one.manifests)),
+        recordings=concatenate([LazySequence.of(one.recordings) for one in reports]),
+    )
+
+
+def report_text(report: RunReport, path: Path) -> Iterator[str]:
+    """Yield the text of a report file, recording by recording: JSON Lines if the suffix of its path says so, else JSON."""
+    if path.suffix == LINES_SUFFIX:
+        yield Header(tool=report.tool, manifests=report.manifests).model_dump_json() + "\n"
+        yield from (recording.model_dump_json() + "\n" for recording in report.recordings)
+        yield Footer(summary=report.summary).model_dump_json() + "\n"
+        return
+    frame = RunReport(tool=report.tool, manifests=report.manifests, recordings=())
+    start, end = frame.with_summary(report.summary).model_dump_json(indent=2).split(_NO_RECORDINGS)
+    yield start + _NO_RECORDINGS[:-1]
+    separator = "\n"
+    for recording in report.recordings:
+        yield separator + indent(recording.model_dump_json(indent=2), "    ")
+        separator = ",\n"
+    yield ("]" if separator == "\n" else "\n  ]") + end + "\n"
+
+
+def _key(sequence: str, destination: str) -> int:
+    """Return a number for a recording, which takes less memory than its names."""
+    return hash((sequence, destination))
+
+
+def _parse_by_recording(content: bytes) -> RunReport | None:
+    """Return the report if the model writes each of its parts byte for byte the same, apart from white space; else None.
+
+    Such a report satisfies the published schema, against which validation takes ten times as long. The recordings are
+    parsed one by one, because the objects of a complete JSON document need several times the memory of its models.
+    """
+    models = {"manifests": UsedManifest, "recordings": Report}
+    try:
+        members = msgspec.json.decode(content, type=dict[str, msgspec.Raw])
+        if not members.keys() <= {*RunReport.model_fields, *RunReport.model_computed_fields}:
+            return None
+        values = {
+            name: tuple(
+                _parse_part(part, models[name]) for part in msgspec.json.decode(raw, type=list[msgspec.Raw])
+            )
+            if name in models
+            else msgspec.json.decode(raw)
+            for name, raw in members.items()
+        }
+        report = RunReport.model_validate(values, strict=True)
+    except ValueError:  # the base class of the errors of msgspec and pydantic
+        return None
+    computed = {"summary": report.summary.model_dump(mode="json"), "exit_code": report.exit_code}
+    return report if all(values.get(name) == value for name, value in computed.items()) else None
+
+
+def _parse_part(raw: msgspec.Raw, model: type[_Model]) -> _Model:
+    part = model.model_validate_json(bytes(raw))
+    if part.model_dump_json().encode() != msgspec.json.format(bytes(raw), indent=-1):
+        raise ValueError("the values differ from the values that the model writes")
+    return part
