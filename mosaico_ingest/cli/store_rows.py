@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.padding import Padding
 from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
@@ -304,8 +305,8 @@ def _print_texts(texts: dict[str, list[str]]) -> None:
         print_line(f"{time_name} {time}", style="bold")
         table = PlainTable("column", "value", header=False)
         for name, column in others:
-            table.add_row(Text(f"  {name}", style="cyan"), column[row])
-        console.print(table)
+            table.add_row(Text(name, style="cyan"), column[row])
+        console.print(Padding.indent(table, 2))
 
 
 def _print_timings(info: SequenceInfo, timings: Sequence[tuple[TopicInfo, TopicTiming]]) -> None:

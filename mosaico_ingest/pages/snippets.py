@@ -8,7 +8,6 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
 from mosaico_ingest.pages.plots import plotted_columns
-from mosaico_ingest.view.columns import topic_columns
 
 
 class Snippet(Struct, frozen=True):
@@ -19,13 +18,13 @@ class Snippet(Struct, frozen=True):
 
 
 def sequence_snippets(store: Store, info: SequenceInfo) -> list[Snippet]:
-    """Return programs for the topic with the most rows; none without rows."""
-    topic = max((topic for topic in info.topics if topic.segments), key=lambda each: each.rows, default=None)
-    if topic is None:
+    """Return programs for the topic with the most rows, of those with numbers if there are any; none without rows."""
+    topics = [topic for topic in info.topics if topic.segments]
+    if not topics:
         return []
-    path, column = str(store.path), _column(topic)
+    topic = max(topics, key=lambda each: (bool(plotted_columns(each)), each.rows))
+    path, steps = str(store.path), _column(topic)
     files = f"{topic.segments[0].path.parent}/*.parquet"
-    steps = column.split(".")
     quoted = ".".join('"' + step.replace('"', '""') + '"' for step in steps)
     sql = f"SELECT timestamp_ns, {quoted} FROM '{files.replace(chr(39), chr(39) * 2)}' ORDER BY timestamp_ns"  # noqa: S608 - shown, not executed
     fields = "".join(f".struct.field({step!r})" for step in steps[1:])
@@ -39,10 +38,9 @@ def sequence_snippets(store: Store, info: SequenceInfo) -> list[Snippet]:
         ),
         Snippet(
             "Python",
-            "from mosaico_ingest.destinations.store import Store\n\n"
-            f"store = Store.open({path!r}, create=False)\n"
-            f"rows = store.scan({info.name!r}, {topic.name!r}, columns=[{steps[0]!r}])\n"
-            "print(rows.read_all().flatten())",
+            "from mosaico_ingest import Store\n\n"
+            f"topic = Store.open({path!r}, create=False).sequence({info.name!r}).topic({topic.name!r})\n"
+            f"print(topic.to_arrow(columns=[{'.'.join(steps)!r}]))",
         ),
         Snippet(
             "Official SDK (mosaicolabs)",
@@ -60,8 +58,7 @@ def sequence_snippets(store: Store, info: SequenceInfo) -> list[Snippet]:
     ]
 
 
-def _column(topic: TopicInfo) -> str:
-    """Return the path of the first number of a topic, or its first column."""
-    first, *others = topic_columns(topic.schema)
-    chosen = (*plotted_columns(topic), *(column for column in others if "[]" not in column.path), first)[0]
-    return ".".join(chosen.steps)
+def _column(topic: TopicInfo) -> tuple[str, ...]:
+    """Return the path of the first number of a topic, otherwise its first column after the time."""
+    numbers = plotted_columns(topic)
+    return tuple(numbers[0].steps) if numbers else tuple(topic.schema.names[1:2] or topic.schema.names)

@@ -20,6 +20,7 @@ COMMANDS = {
     "describe": ["store", "describe", "quickstart_drive"],
     "describe topic": ["store", "describe", "quickstart_drive/odom"],
     "head": ["store", "head", "quickstart_drive/odom", "-n", "2", "--flatten"],
+    "head without flattening": ["store", "head", "quickstart_drive/lidar/points", "-n", "1"],
     "plot": ["store", "plot", "quickstart_drive/imu", "acceleration"],
     "sql": ["store", "sql"],
     "inspect": ["inspect", "configs/quickstart/drive.mcap"],
@@ -66,6 +67,8 @@ def test_command_output_fits_terminal_without_breaking_words(project: Path, name
     words = {word.rstrip(",:") for line in lines for word in line.split()}
     if name in {"show", "describe", "inspect", "plan", "report"}:
         assert set(TOPICS) <= words
+    if name == "head without flattening":
+        assert "is_bigendian" in words
     if name in {"inspect", "plan"}:
         assert {"sensor_msgs/msg/CompressedImage", "CompressedImageAdapter"} <= words
 

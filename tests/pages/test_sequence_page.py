@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 from run_reports import Outline, unpacked
-from stored_sequences import NASTY, write_sequence
+from stored_sequences import NASTY, NUMBERS, T0, TEXT, write_sequence
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
@@ -111,8 +111,18 @@ def test_snippets_run_and_print_rows(store: Store) -> None:
         assert "acceleration" in result.stdout or '"x"' in result.stdout or "x" in result.stdout
 
 
+def test_snippets_select_a_topic_with_numbers_and_a_column_beside_the_time(tmp_path: Path) -> None:
+    store = Store.open(tmp_path / "store")
+    numbers = [{"timestamp_ns": T0, "value": 1.0, "constant": 7, "wheels": []}]
+    texts = [{"timestamp_ns": T0 + at, "data": "x"} for at in range(5)]
+    write_sequence(store, "drive", {"/text": (TEXT, texts), "/numbers": (NUMBERS, numbers)})
+    write_sequence(store, "texts", {"/text": (TEXT, texts)})
+    code = {name: sequence_snippets(store, store.sequence(name))[0].code for name in ("drive", "texts")}
+    assert 'SELECT timestamp_ns, "value" FROM' in code["drive"]
+    assert 'SELECT timestamp_ns, "data" FROM' in code["texts"]
+
+
 def test_snippets_quote_names(tmp_path: Path) -> None:
-    from stored_sequences import T0, TEXT  # noqa: PLC0415 - only this test needs it
 
     store = Store.open(tmp_path / "it's here")
     write_sequence(store, "drive", {"/a": (TEXT, [{"timestamp_ns": T0, "data": "x"}])})
