@@ -151,8 +151,10 @@ def _outermost(text: str) -> str:
 def _similar(keys: Iterable[str], known: Iterable[str]) -> set[str]:
     """Return the known keys that one of `keys` equals or nearly equals."""
     names = sorted(known)
-    plain = (key.lower().replace("-", "_") for key in keys)
-    return {match for key in plain for match in get_close_matches(key, names, n=1, cutoff=_SIMILARITY)}
+    plain = [key.lower().replace("-", "_") for key in keys]
+    swapped = {name for name in names if any(sorted(key) == sorted(name) for key in plain)}
+    near = {match for key in plain for match in get_close_matches(key, names, n=1, cutoff=_SIMILARITY)}
+    return swapped | near
 
 
 def _yaml_blocks(text: str) -> Iterator[str]:

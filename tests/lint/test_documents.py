@@ -124,6 +124,8 @@ def test_lint_named_foreign_file_checks_it_as_job(tmp_path: Path) -> None:
     [
         ("adapter: X\n", Kind.ADAPTER),
         ("version: 1\nadaptr: X\n", Kind.ADAPTER),
+        ("version: 1\nbga: {path: .}\n", Kind.JOB),
+        ("version: 1\ntag: x\n", None),
         ("ontology: IMU\nfields: {a: b}\n", Kind.ADAPTER),
         ("sequence: {adapter: X}\n", None),
         ("extends: base.yaml\n", Kind.JOB),
