@@ -140,7 +140,7 @@ class _Builder:
             return pa.nulls(0, kind)  # type: ignore[call-overload]  # the stubs restrict it to extension types
         match column:
             case NumberColumn():
-                return self._leaf(column, kind, inst)
+                return self._numbers(column, kind, inst)
             case TextColumn():
                 return self._texts(column, kind, inst)
             case FixedArrayColumn(count=size, item=item):
@@ -155,10 +155,10 @@ class _Builder:
                 ]
                 return array_of(kind, count, children=arrays)
 
-    def _leaf(self, leaf: NumberColumn, kind: pa.DataType, inst: _Instances) -> Array:
-        number = np.dtype(f"{self._order}{'u1' if leaf.type == 'bool' else NUMBERS[leaf.type]}")
-        view = self._block(inst, leaf.step).numbers(number, leaf.offset, leaf.dims)
-        if leaf.type == "bool":
+    def _numbers(self, column: NumberColumn, kind: pa.DataType, inst: _Instances) -> Array:
+        number = np.dtype(f"{self._order}{'u1' if column.type == 'bool' else NUMBERS[column.type]}")
+        view = self._block(inst, column.step).numbers(number, column.offset, column.dims)
+        if column.type == "bool":
             return array_of(kind, view.size, np.packbits(view != 0, bitorder="little"))
         flags = view.flags
         if not (flags.c_contiguous and flags.aligned and number.isnative):
@@ -172,13 +172,13 @@ class _Builder:
             inst.blocks[number] = fixed_cells(self._data, inst.offsets[number].at, size)
         return inst.blocks[number]
 
-    def _items(self, items: ListColumn, kind: pa.DataType, inst: _Instances) -> Array:
-        offsets = inst.offsets[items.step]
+    def _items(self, column: ListColumn, kind: pa.DataType, inst: _Instances) -> Array:
+        offsets = inst.offsets[column.step]
         if pa.types.is_binary(kind):
             data = copy_slices(self._data, offsets.at, offsets.counts)
             return array_of(kind, inst.count, list_offsets(offsets.counts), data)
-        inner = self._elements(items.of, offsets, inst)
-        values = self.column(items.item, kind.field(0).type, inner, inner.count)
+        inner = self._elements(column.of, offsets, inst)
+        values = self.column(column.item, kind.field(0).type, inner, inner.count)
         if pa.types.is_fixed_size_list(kind):
             return array_of(kind, inst.count, children=[values])
         return array_of(kind, inst.count, list_offsets(offsets.counts), children=[values])
@@ -196,8 +196,8 @@ class _Builder:
         inner.blocks[0] = Cells(copy_slices(self._data, offsets.at, counts * size), total, size)
         return inner
 
-    def _texts(self, words: TextColumn, kind: pa.DataType, inst: _Instances) -> Array:
-        text, offsets = words.text, inst.offsets[words.step]
+    def _texts(self, column: TextColumn, kind: pa.DataType, inst: _Instances) -> Array:
+        text, offsets = column.text, inst.offsets[column.step]
         sizes = self._without_nul(inst, offsets) if text.has_nul else offsets.counts * text.unit
         data = copy_slices(self._data, offsets.at, sizes)
         if text.unit == 1:

@@ -8,13 +8,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.ontology.types import PLAIN_TYPES
 
-_PLAIN = {
-    pa.string_view(): pa.string(),
-    pa.large_string(): pa.string(),
-    pa.binary_view(): pa.binary(),
-    pa.large_binary(): pa.binary(),
-}
 _arrow: Any = pa
 """pyarrow, whose stubs do not accept `type` together with `mask`."""
 
@@ -27,7 +22,7 @@ def comparable(kind: Any) -> Any:  # noqa: ANN401 - any Arrow type
         return pa.list_(comparable(kind.value_type))
     if pa.types.is_fixed_size_list(kind):
         return pa.list_(comparable(kind.value_type), kind.list_size)
-    return _PLAIN.get(kind, kind)
+    return PLAIN_TYPES.get(kind, kind)
 
 
 def as_type(array: Any, kind: Any, name: str = "") -> Any:  # noqa: ANN401 - any array and type

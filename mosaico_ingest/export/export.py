@@ -296,22 +296,22 @@ class Definitions(Struct, frozen=True):
 
 
 def _assumed_restorer(
-    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], known: Definitions
+    source: SourceSequence, info: SourceTopic, specs: Sequence[AdapterSpec], definitions: Definitions
 ) -> Restorer | None:
     """Return the restorer of a topic whose metadata has no definition, or None if no adapter produces its columns.
 
     The message type is the one of an adapter's types, as defined by the distro, that changes the fewest values of the first rows.
     """
-    version = 1 if known.distro.value.startswith("ros1") else 2
+    version = 1 if definitions.distro.value.startswith("ros1") else 2
     restorers: list[Restorer] = []
     for spec in (*specs, *(spec for spec in BUILTIN if spec.tag == info.ontology.tag)):
         for msgtype in spec.ros_types:
             with suppress(AdapterError, BagError):
-                definition = known.finder.find(msgtype, spec)
+                definition = definitions.finder.find(msgtype, spec)
                 adapter = spec.bind(definition, ros_shape(definition))
                 if definition.ros_version == version and _produces(adapter, info):
                     inverse = invert(adapter, definition, info.metadata)
-                    assumed = f"{definition.root} of {known.distro.value}"
+                    assumed = f"{definition.root} of {definitions.distro.value}"
                     restorers.append(
                         Restorer(info, definition, spec.name, adapter.ontology, inverse, assumed)
                     )

@@ -14,11 +14,11 @@ def columns_file() -> str:
     return "{\n" + ",\n".join(entries) + "\n}\n"
 
 
-def _entry(tag: str, made: OntologyType) -> str:
+def _entry(tag: str, ontology: OntologyType) -> str:
     columns = ",\n".join(
-        f'  "{name}": {json.dumps(kind)}' for name, kind in encode_fields(made.struct).items()
+        f'  "{name}": {json.dumps(kind)}' for name, kind in encode_fields(ontology.struct).items()
     )
-    return f' "{tag}": {{"format": "{made.serialization_format.value}", "columns": {{\n{columns}\n }}}}'
+    return f' "{tag}": {{"format": "{ontology.serialization_format.value}", "columns": {{\n{columns}\n }}}}'
 
 
 if __name__ == "__main__":

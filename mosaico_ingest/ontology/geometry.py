@@ -131,7 +131,7 @@ class _LinearOrAngular(BaseModel):
     @model_validator(mode="after")
     def _has_one(self) -> Self:
         if self.linear is None and self.angular is None:
-            raise ValueError("linear or angular must be given")
+            raise ValueError("linear or angular is required")
         return self
 
 

@@ -91,18 +91,20 @@ class _Column(Struct, frozen=True):
 def _struct(model: type[BaseModel], outer: tuple[type[BaseModel], ...]) -> pa.StructType:
     if model in outer:
         raise AdapterError(
-            "contains itself, which columns cannot", where=model.__name__, hint="refer to it by a key"
+            "a model that contains itself has no columns",
+            where=model.__name__,
+            hint="refer to the inner model by a key",
         )
     inside = (*outer, model)
     fields: list[pa.Field[Any]] = []
     for name, field in model.model_fields.items():
-        column = _take_apart(field.annotation, field.metadata)
+        column = _analyze(field.annotation, field.metadata)
         data_type = _arrow(column, f"{model.__name__}.{name}", inside)
         fields.append(pa.field(name, data_type, nullable=column.nullable))
     return pa.struct(fields)
 
 
-def _take_apart(annotation: Any, metadata: Iterable[object] = ()) -> _Column:  # noqa: ANN401 - any annotation
+def _analyze(annotation: Any, metadata: Iterable[object] = ()) -> _Column:  # noqa: ANN401 - any annotation
     marks = list(metadata)
     nullable = False
     while True:
@@ -149,7 +151,7 @@ def _list(column: _Column, where: str, outer: tuple[type[BaseModel], ...]) -> pa
         raise AdapterError(
             f"the annotation {_spell(column.bare)} mixes item types", where=where, hint="use a nested model"
         )
-    item = pa.field("item", _arrow(_take_apart(items[0]), f"{where}[]", outer))
+    item = pa.field("item", _arrow(_analyze(items[0]), f"{where}[]", outer))
     return pa.list_(item, column.size)
 
 
@@ -184,7 +186,7 @@ class Serializable(BaseModel):
         tag = cls.__dict__.get("__ontology_tag__", cls.__name__)
         if tag in MODULES and cls.__module__ != f"{__package__}.{MODULES[tag]}":
             raise AdapterError(
-                f"the tag {tag!r} is a built-in's",
+                f"the tag {tag!r} belongs to a built-in model",
                 where=f"{cls.__module__}.{cls.__qualname__}",
                 hint="rename the class or set __ontology_tag__",
             )
@@ -248,7 +250,7 @@ def _array(rows: list[dict[str, Any]], columns: pa.StructType) -> pa.StructArray
 
 
 def _misfit(row: dict[str, Any], columns: pa.StructType) -> str | None:
-    """Return why `row` does not fit, None if it fits."""
+    """Return the reason why a row does not fit its columns, or None if it fits."""
     try:
         _array([row], columns)
     except _MISFITS as reason:

@@ -247,4 +247,4 @@ class GridCells(Stamped, Serializable):
     cell_height: Float32
     """m."""
     cells: list[Point3d]
-    """Centres of the cells, m."""
+    """Centers of the cells, m."""

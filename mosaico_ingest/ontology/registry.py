@@ -63,12 +63,12 @@ _arrow: Any = pa
 @cache
 def builtin_type(tag: str) -> OntologyType:
     """Return the ontology type of a built-in tag; raises KeyError for any other tag."""
-    entry = _known()[tag]
+    entry = _entries()[tag]
     return OntologyType(tag, pa.struct(_fields(entry["columns"])), SerializationFormat(entry["format"]))
 
 
 @cache
-def _known() -> dict[str, dict[str, Any]]:
+def _entries() -> dict[str, dict[str, Any]]:
     return json.loads(COLUMNS_FILE.read_bytes())
 
 
@@ -89,15 +89,15 @@ def _type(kind: EncodedType) -> pa.DataType:
 
 def encode_fields(struct: pa.StructType) -> dict[str, EncodedType]:
     """Return the fields of a struct as in `columns.json`."""
-    return {field.name + "?" * field.nullable: _written(field.type) for field in struct}
+    return {field.name + "?" * field.nullable: _encode_type(field.type) for field in struct}
 
 
-def _written(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide the members of nested types
+def _encode_type(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide the members of nested types
     if pa.types.is_struct(kind):
         return encode_fields(kind)
     if pa.types.is_fixed_size_list(kind):
-        return [_written(kind.value_type), kind.list_size]
-    return [_written(kind.value_type)] if pa.types.is_list(kind) else str(kind)
+        return [_encode_type(kind.value_type), kind.list_size]
+    return [_encode_type(kind.value_type)] if pa.types.is_list(kind) else str(kind)
 
 
 class UnknownTag(AdapterError, KeyError):  # noqa: N818 - the condition, as `NothingMatched`
@@ -108,15 +108,15 @@ def model(tag: str) -> type[Serializable]:
     """Return the class of a tag: the last one defined, otherwise the built-in.
 
     Raises:
-        UnknownTag: There is none; names the nearest.
+        UnknownTag: No model has the tag; the hint names the nearest tags.
     """
     if tag not in DEFINED and tag in MODULES:
         import_module(f"mosaico_ingest.ontology.{MODULES[tag]}")
     if tag in DEFINED:
         return DEFINED[tag]
-    by_letters = {_letters(known): known for known in tags()}
+    by_letters = {_letters(each): each for each in tags()}
     near = [by_letters[name] for name in get_close_matches(_letters(tag), by_letters, n=3)]
-    hint = f"did you mean {' or '.join(near)}?" if near else f"known are {', '.join(tags())}"
+    hint = f"did you mean {' or '.join(near)}?" if near else f"the tags are {', '.join(tags())}"
     raise UnknownTag(f"no ontology model has the tag {tag!r}", hint=hint)
 
 
@@ -124,7 +124,7 @@ def ontology_type(tag: str) -> OntologyType:
     """Return the ontology type of a tag.
 
     Raises:
-        UnknownTag: There is none; names the nearest.
+        UnknownTag: No model has the tag; the hint names the nearest tags.
     """
     return builtin_type(tag) if tag in MODULES else model(tag).ontology_type()
 

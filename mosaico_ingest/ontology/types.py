@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from enum import Enum
 from typing import Any, TypeAlias, cast
 
@@ -15,12 +15,13 @@ from msgspec import Struct
 
 from mosaico_ingest.caching import cache_by_identity
 
-_PLAIN: dict[pa.DataType, pa.DataType] = {
+PLAIN_TYPES: Mapping[pa.DataType, pa.DataType] = {
     pa.large_string(): pa.string(),
     pa.string_view(): pa.string(),
     pa.large_binary(): pa.binary(),
     pa.binary_view(): pa.binary(),
 }
+"""The plain type of texts and bytes by their large and view types."""
 
 
 class SerializationFormat(str, Enum):
@@ -47,7 +48,9 @@ class OntologyType(Struct, frozen=True):
 @cache_by_identity
 def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's text; top-level large and view types count as plain."""
-    fields = [pa.field(field.name, _PLAIN.get(field.type) or field.type, field.nullable) for field in struct]
+    fields = [
+        pa.field(field.name, PLAIN_TYPES.get(field.type) or field.type, field.nullable) for field in struct
+    ]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]
 
 
@@ -62,7 +65,7 @@ class RequiredFields:
     """Fills the required fields of a struct type; the constructor finds them once for all batches of a topic."""
 
     def __init__(self, kind: pa.StructType) -> None:
-        self._fill = _filling(kind)
+        self._fill = _fill_of(kind)
 
     def fill(self, rows: pa.StructArray) -> pa.StructArray:
         """Return the rows with zeros in required fields that are null because their struct is null.
@@ -78,7 +81,7 @@ class NullRows:
 
     def __init__(self, kind: Any) -> None:  # noqa: ANN401 - any Arrow type; the stubs have no common base with children
         self._kind = kind
-        self._fill = _filling(kind)
+        self._fill = _fill_of(kind)
         self._kept: Any = None
 
     def __reduce__(self) -> tuple[Any, ...]:
@@ -96,28 +99,28 @@ class NullRows:
         return rows
 
 
-def _filling(kind: Any) -> _Fill | None:  # noqa: ANN401 - any Arrow type
+def _fill_of(kind: Any) -> _Fill | None:  # noqa: ANN401 - any Arrow type
     """Return a function that fills arrays of a type, None if nothing inside is required."""
     if pt.is_struct(kind):
-        return _filling_struct(list(kind))
+        return _struct_fill(list(kind))
     if pt.is_fixed_size_list(kind):
-        inner = _filling(kind.value_type)
-        return None if inner is None else lambda array: _filled_fixed(array, inner)
+        inner = _fill_of(kind.value_type)
+        return None if inner is None else lambda array: _fill_fixed(array, inner)
     if pt.is_list(kind):
-        inner = _filling(kind.value_type)
-        return None if inner is None else lambda array: _filled_list(array, inner)
+        inner = _fill_of(kind.value_type)
+        return None if inner is None else lambda array: _fill_list(array, inner)
     return None
 
 
-def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
-    inner = [_filling(field.type) for field in fields]
+def _struct_fill(fields: list[pa.Field[Any]]) -> _Fill | None:
+    inner = [_fill_of(field.type) for field in fields]
     watched = [
         (position, fill, field.nullable)
         for position, (field, fill) in enumerate(zip(fields, inner, strict=True))
         if fill is not None or not field.nullable
     ]
 
-    def filled_struct(array: Any) -> Any:  # noqa: ANN401 - an Arrow array
+    def fill_struct(array: Any) -> Any:  # noqa: ANN401 - an Arrow array
         changed: dict[int, Any] = {}
         for position, fill, nullable in watched:
             child = array.field(position)
@@ -132,10 +135,10 @@ def _filling_struct(fields: list[pa.Field[Any]]) -> _Fill | None:
         mask = pc.is_null(array) if array.null_count else None
         return pa.StructArray.from_arrays(children, fields=fields, mask=mask)
 
-    return filled_struct if watched else None
+    return fill_struct if watched else None
 
 
-def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
+def _fill_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
     size = array.type.list_size
     values = array.values.slice(array.offset * size, len(array) * size)
     filled = fill(values)
@@ -145,7 +148,7 @@ def _filled_fixed(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow ar
     return _arrays.FixedSizeListArray.from_arrays(filled, type=array.type, mask=mask)
 
 
-def _filled_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
+def _fill_list(array: Any, fill: _Fill) -> Any:  # noqa: ANN401 - an Arrow array
     values = array.values
     filled = fill(values)
     if filled is values:

@@ -126,7 +126,7 @@ def test_serializable_subclass_of_model_has_own_tag() -> None:
 
 def test_serializable_with_builtin_tag_raises() -> None:
     with pytest.raises(
-        AdapterError, match=r"'IMU' is a built-in's — rename the class or set __ontology_tag__"
+        AdapterError, match=r"'IMU' belongs to a built-in model — rename the class or set __ontology_tag__"
     ):
         type("IMU", (Serializable,), {"__module__": __name__})
 
@@ -137,7 +137,7 @@ def test_model_unknown_tag_suggests_nearest() -> None:
     assert isinstance(caught.value, KeyError)
     with pytest.raises(UnknownTag, match=r"did you mean Vector3d"):
         model("vector_3_d")
-    with pytest.raises(UnknownTag, match=r"known are Acceleration, "):
+    with pytest.raises(UnknownTag, match=r"the tags are Acceleration, "):
         model("?")
 
 
@@ -164,7 +164,7 @@ class Tree(Serializable):
 
 
 def test_struct_of_recursive_model_raises() -> None:
-    with pytest.raises(AdapterError, match="Tree: contains itself"):
+    with pytest.raises(AdapterError, match="Tree: a model that contains itself"):
         Tree.ontology_type()
 
 
@@ -236,7 +236,7 @@ def test_time_converts_to_datetime_and_seconds() -> None:
 
 def test_velocity_without_components_raises() -> None:
     assert Velocity(linear=Vector3d(x=1, y=2, z=3)).angular is None
-    with pytest.raises(AdapterError, match="linear or angular must be given"):
+    with pytest.raises(AdapterError, match="linear or angular is required"):
         Velocity.from_row({})
 
 
