@@ -4,7 +4,8 @@
 
 A stand-in has the topics, types, rates and storage of its sequence as far as they are known (`r2b_sequences.py`); images and
 points are random. `--scale` shortens it, `--generate` only writes it, and `--page` writes the tables of the documentation, with `--runs 0` without
-a measurement.
+a measurement. Sequences are generated message by message, one after the other, and deleted after the measurement, so that `--scale 1`
+needs twice the size of the largest one on disk.
 """
 
 from __future__ import annotations
@@ -241,6 +242,7 @@ def results(sequences: list[Sequence], data: Path, scale: float, runs: int, *, g
         print(f"{sequence.name}: {size / 1e6:.1f} MB, expected {sequence.file_bytes * part / 1e6:.1f} MB")
         if not generate:
             sample, ratio = measure(sequence, data, runs)
+            shutil.rmtree(data / sequence.name)
             saved = round((1 - ratio) * 100)
             rows.append(
                 f"| {sequence.name} | {size / 1e6:.0f} MB | {saved} % | {sample.wall_s:.2f} s | {sample.cpu_s:.2f} s "
@@ -309,13 +311,16 @@ def main() -> None:
     head = "| sequence | stand-in | saved | time | CPU | peak memory | content |"
     table = "\n".join([head, "|---|---:|---:|---:|---:|---:|---|", *rows])
     system = f"{hardware()}, {platform.system()}, Python {platform.python_version()}"
-    text = f"{system}; scale {options.scale}, median of {options.runs}:\n\n{table}"
+    command = " ".join(
+        ["./dev bench r2b", *options.sequences, f"--scale {options.scale:g} --runs {options.runs}"]
+    )
+    text = f"{system}; scale {options.scale:g}, median of {options.runs}; `{command}`:\n\n{table}"
     if rows:
         print(text)
     if options.page:
         write_between(options.page, "sequences", topic_tables())
         if rows:
-            write_between(options.page, "results", text)
+            write_between(options.page, "complete results" if options.scale == 1 else "results", text)
 
 
 if __name__ == "__main__":
