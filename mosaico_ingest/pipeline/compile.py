@@ -321,16 +321,16 @@ def _resolve_paths(loaded: LoadedManifest) -> Manifest:
 
         def resolve(path: tuple[str | int, ...], text: str, role: PathRole = role) -> str:
             if role is PathRole.STORE:
-                found = loaded.resolve_or_url(text, *path)
-                return text if isinstance(found, RemotePath) else str(found)
-            found = loaded.resolve(text, *path)
-            if role in _READ_LATER and not found.exists():
+                resolved = loaded.resolve_or_url(text, *path)
+                return text if isinstance(resolved, RemotePath) else str(resolved)
+            resolved = loaded.resolve(text, *path)
+            if role in _READ_LATER and not resolved.exists():
                 raise ManifestError(
-                    f"no such file or directory: {found}",
+                    f"no such file or directory: {resolved}",
                     where=loaded.where(*path),
                     hint="correct the path; relative paths start at the manifest's folder",
                 )
-            return str(found)
+            return str(resolved)
 
         if role is not PathRole.RECORDING:
             manifest = replace_values(manifest, field.path, resolve)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, cast
 
 import numpy as np
@@ -43,11 +43,7 @@ class ContractRun(Struct, frozen=True):
         monitor = monitor_of(plan, recording)
         if monitor is None:
             return None
-        pipelines = pipelines_by_connection(topics)
-        for connection, topic in pipelines.items():
-            observer = monitor.observer(connection)
-            if observer is not None:
-                topic.observers[connection] = observer
+        attach_monitor(monitor, pipelines_by_connection(topics))
         return cls(plan, monitor, tuple(topic for topic in topics if not topic.plan.shares_messages))
 
     @property
@@ -105,6 +101,14 @@ def monitor_of(plan: Plan, recording: Recording) -> RecordingMonitor | None:
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
     )
+
+
+def attach_monitor(monitor: RecordingMonitor, pipelines: Mapping[int, TopicPipeline]) -> None:
+    """Let a monitor observe the messages of the pipelines, which are given by connection."""
+    for connection, topic in pipelines.items():
+        observer = monitor.observer(connection)
+        if observer is not None:
+            topic.observers[connection] = observer
 
 
 def check_group(plan: Plan) -> None:

@@ -110,13 +110,13 @@ def read_lock(file: LockFile) -> LockDocument:
 
 
 def lock_of(plan: Plan, connections: Sequence[Connection]) -> LockDocument:
-    """Return the lock of one recording's plan; `connections` are those of the recording, by id."""
+    """Return the lock of one recording's plan; `connections` are the recording's connections, by id."""
     topics: dict[str, LockedTopic] = {}
     definitions: dict[str, dict[str, tuple[str, ...]]] = {}
     for topic in plan.topics:
         name = topic.topic if topic.topic not in topics else f"{topic.topic} as {topic.target}"
-        known = (connections[connection].definition for connection in topic.connections)
-        types = _types_of([definition for definition in known if definition is not None])
+        candidates = (connections[connection].definition for connection in topic.connections)
+        types = _types_of([definition for definition in candidates if definition is not None])
         key = _definition_key(definitions, topic.msgtype, types)
         definitions[key] = types
         topics[name] = LockedTopic(
@@ -166,8 +166,8 @@ def check_lock(file: LockFile, actual: LockDocument, *, recording: str) -> None:
         ContractError: They differ; `findings` has every difference with its location in the lock file.
         ManifestError: The text is not a lock file.
     """
-    found = lock_differences(read_lock(file), actual)
-    first = next(iter(found), None)
+    differences = lock_differences(read_lock(file), actual)
+    first = next(iter(differences), None)
     if first is None:
         return
     source = load_source(file.text, file=file.path)
@@ -175,9 +175,9 @@ def check_lock(file: LockFile, actual: LockDocument, *, recording: str) -> None:
         Finding(
             "definition-difference", Severity.ERROR, str(one), _span(source.spans, source.key_spans, one.path)
         )
-        for one in found
+        for one in differences
     )
-    more = f" (and {counted(len(found) - 1, 'more difference')})" if len(found) > 1 else ""
+    more = f" (and {counted(len(differences) - 1, 'more difference')})" if len(differences) > 1 else ""
     raise ContractError(
         f"the recording differs from {file.path}: {first}{more}",
         where=recording,
@@ -188,16 +188,16 @@ def check_lock(file: LockFile, actual: LockDocument, *, recording: str) -> None:
 
 def lock_differences(lock: LockDocument, actual: LockDocument) -> tuple[LockDifference, ...]:
     """Return the differences of a recording from a lock, by topic."""
-    found: list[LockDifference] = []
+    differences: list[LockDifference] = []
     for name in sorted({*lock.topics, *actual.topics}):
         if name in lock.topics and name in actual.topics:
-            found += _topic_differences(name, lock, actual)
+            differences += _topic_differences(name, lock, actual)
         elif name in actual.topics:
-            found.append(LockDifference(Change.NEW_TOPIC, name, actual.topics[name].type, ("topics",)))
+            differences.append(LockDifference(Change.NEW_TOPIC, name, actual.topics[name].type, ("topics",)))
         elif lock.topics[name].required:
             path = ("topics", name)
-            found.append(LockDifference(Change.MISSING_TOPIC, name, lock.topics[name].type, path))
-    return tuple(dict.fromkeys(found))
+            differences.append(LockDifference(Change.MISSING_TOPIC, name, lock.topics[name].type, path))
+    return tuple(dict.fromkeys(differences))
 
 
 def _sorted(

@@ -38,8 +38,8 @@ def latched_blocks(
             early[block.connection].append(block)
             continue
         last = block.rows(slice(len(block) - 1, None))
-        known = latest.get(block.connection)
-        if known is None or last.log_times[0] >= known.log_times[0]:
+        previous = latest.get(block.connection)
+        if previous is None or last.log_times[0] >= previous.log_times[0]:
             latest[block.connection] = last
     for connection in static:
         yield from early[connection]
@@ -61,7 +61,7 @@ def _early_blocks(
 
 
 def _latest_blocks(plan: Plan, recording: Recording, static: dict[int, bool]) -> Iterator[MessageBlock]:
-    """Yield messages before the log time at which the range starts; the index tells where the latest one is."""
+    """Yield messages before the log time at which the range starts; the index has the log time of the latest one."""
     single = [connection for connection, is_all in static.items() if not is_all]
     times = recording.index_times(single, end_ns=plan.read_from_ns) if single else {}
     complete = [connection for connection, is_all in static.items() if is_all or times is None]

@@ -22,7 +22,7 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.patterns import first_match
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.pipeline.contract import monitor_of
+from mosaico_ingest.pipeline.contract import attach_monitor, monitor_of
 from mosaico_ingest.pipeline.contract_group import results_by_job
 from mosaico_ingest.pipeline.contract_messages import index_results, sample_results
 from mosaico_ingest.pipeline.opening import open_job
@@ -39,7 +39,7 @@ from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import StoredProvenance, is_repeatable, read_provenance
 from mosaico_ingest.pipeline.run import preflight
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs
+from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines_by_connection
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.remote import RemotePath
@@ -98,7 +98,7 @@ def _sequence_problem(plan: Plan, existing: ExistingSequence) -> str | None:
 
 
 def _estimate(plan: Plan, samples: dict[str, Sample]) -> int | None:
-    """Return the uncompressed bytes of all rows, None if the index or the sample does not tell."""
+    """Return the uncompressed bytes of all rows, None if the index or the sample lacks a number."""
     sizes = [_topic_bytes(topic, samples[topic.target]) for topic in plan.topics if topic.count != 0]
     if any(size is None for size in sizes):
         return None
@@ -136,20 +136,12 @@ def try_messages(
         counts = _counts(plan, recording)
         trials = tuple(_trial(topic, recording, session, counts) for topic in plan.topics)
         link_outputs([trial.topic for trial in trials])
-        by_connection = {
-            connection: trial
-            for trial in trials
-            if not trial.topic.plan.shares_messages
-            for connection in trial.topic.plan.connections
-        }
+        pipelines = pipelines_by_connection(trial.topic for trial in trials)
         if monitor is not None:
-            for connection, trial in by_connection.items():
-                observer = monitor.observer(connection)
-                if observer is not None:
-                    trial.topic.observers[connection] = observer
+            attach_monitor(monitor, pipelines)
         with WriteBuffer(max_bytes=_MEMORY_BYTES) as buffer:
-            for block in _blocks(plan, recording, by_connection):
-                by_connection[block.connection].topic.process(block, buffer)
+            for block in _blocks(plan, recording, pipelines):
+                pipelines[block.connection].process(block, buffer)
     stored = {topic.topic: topic for topic in session.stored()}
     return tuple(trial.sample(stored.get(trial.topic.plan.target)) for trial in trials)
 
@@ -189,7 +181,7 @@ class _Trial(Struct, frozen=True):
 
 
 def _counts(plan: Plan, recording: Recording) -> Mapping[int, int | None]:
-    """Return the number of messages of each connection in the time range; None if the index does not tell."""
+    """Return the number of messages of each connection in the time range; None if the index has no numbers."""
     if plan.read_from_ns is None and plan.read_until_ns is None:
         return {connection.id: connection.count for connection in recording.connections}
     connections = [connection for topic in plan.read_topics for connection in topic.connections]
@@ -212,31 +204,33 @@ def _trial(
     connections = {connection.id: connection for connection in recording.connections}
     for connection in topic.connections:
         pipeline.bind(connections[connection])
-    known = [count for key in topic.connections if (count := counts[key]) is not None]
-    return _Trial(pipeline, rejections, sum(known) if len(known) == len(topic.connections) else None)
+    numbers = [count for key in topic.connections if (count := counts[key]) is not None]
+    return _Trial(pipeline, rejections, sum(numbers) if len(numbers) == len(topic.connections) else None)
 
 
-def _blocks(plan: Plan, recording: Recording, trials: dict[int, _Trial]) -> Iterator[MessageBlock]:
+def _blocks(
+    plan: Plan, recording: Recording, pipelines: Mapping[int, TopicPipeline]
+) -> Iterator[MessageBlock]:
     """Yield message blocks until every topic has its sample; then read topics without any message by the index."""
-    yield from _sample_blocks(plan, recording, trials, enough=MESSAGES)
+    yield from _sample_blocks(plan, recording, pipelines, enough=MESSAGES)
     missing = {
-        connection: trial
-        for connection, trial in trials.items()
-        if not trial.topic.read and trial.topic.plan.count
+        connection: pipeline
+        for connection, pipeline in pipelines.items()
+        if not pipeline.read and pipeline.plan.count
     }
     if missing:
         yield from _sample_blocks(plan, recording, missing, enough=1)
 
 
 def _sample_blocks(
-    plan: Plan, recording: Recording, trials: dict[int, _Trial], *, enough: int
+    plan: Plan, recording: Recording, pipelines: Mapping[int, TopicPipeline], *, enough: int
 ) -> Iterator[MessageBlock]:
     is_remote = any(isinstance(path, RemotePath) for path in recording.files)
     remaining_bytes = _REMOTE_SAMPLE_BYTES if is_remote else _SAMPLE_BYTES
     deadline = time.monotonic() + _SAMPLE_S
     memory_bytes = min(remaining_bytes, _MEMORY_BYTES)
     blocks = recording.message_blocks(
-        tuple(trials),
+        tuple(pipelines),
         start_ns=plan.read_from_ns,
         end_ns=plan.read_until_ns,
         max_rows=MESSAGES,
@@ -244,9 +238,9 @@ def _sample_blocks(
     )
     for block in blocks:
         remaining_bytes -= int(block.lengths.sum())
-        if trials[block.connection].topic.read < enough:
+        if pipelines[block.connection].read < enough:
             yield block
-        if all(trial.topic.read >= enough for trial in trials.values()):
+        if all(pipeline.read >= enough for pipeline in pipelines.values()):
             return
         if remaining_bytes < 0 or time.monotonic() > deadline:
             return
@@ -259,36 +253,38 @@ def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect:
         IngestError: A job cannot be done; `findings` states the reason for each of them.
     """
     groups = results_by_job(jobs)
-    tried = [
-        _tried(job, connect=connect, group=groups.get(position, ())) for position, job in enumerate(jobs)
+    outcomes = [
+        _plan_or_error(job, connect=connect, group=groups.get(position, ()))
+        for position, job in enumerate(jobs)
     ]
-    planned = tuple(one for one in tried if isinstance(one, RecordingPlan))
-    refused = [one for one in tried if isinstance(one, IngestError)]
-    if refused:
-        raise refused[0] if len(tried) == 1 else _all_of(refused, len(tried))
+    errors = [outcome for outcome in outcomes if isinstance(outcome, IngestError)]
+    if errors:
+        raise errors[0] if len(outcomes) == 1 else _all_of(errors, len(outcomes))
     return PlanDocument(
         tool=f"mosaico-ingest {__version__}",
         job=Path(relpath(manifest, folder)).as_posix(),
-        recordings=planned,
+        recordings=tuple(outcome for outcome in outcomes if isinstance(outcome, RecordingPlan)),
     )
 
 
-def _tried(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...]) -> RecordingPlan | IngestError:
+def _plan_or_error(
+    job: Job, *, connect: bool, group: tuple[ExpectationResult, ...]
+) -> RecordingPlan | IngestError:
     try:
         return preview(job, connect=connect, group=group)
     except IngestError as error:
         return error
 
 
-def _all_of(refused: Sequence[IngestError], count: int) -> IngestError:
+def _all_of(errors: Sequence[IngestError], count: int) -> IngestError:
     """Return one error for several recordings, with the lowest exit code."""
     findings = [
         finding
-        for error in refused
+        for error in errors
         for finding in error.findings or (Finding("plan-failed", Severity.ERROR, str(error)),)
     ]
-    one = min(refused, key=lambda error: error.exit_code)
-    one.what, one.where, one.hint = f"{len(refused)} of {count} recordings cannot be ingested", None, None
+    one = min(errors, key=lambda error: error.exit_code)
+    one.what, one.where, one.hint = f"{len(errors)} of {count} recordings cannot be ingested", None, None
     one.findings = tuple(dict.fromkeys(findings))
     return one
 
@@ -311,7 +307,7 @@ def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = (
     document = plan.document(folder=job.folder)
     state = ask_destination(plan, samples, connect=connect)
     warnings = preflight(plan) if connect and state.exists else ()
-    found = (finding for finding in (space_finding(state), *warnings) if finding is not None)
+    destination_findings = (finding for finding in (space_finding(state), *warnings) if finding is not None)
     return RecordingPlan(
         digest=digest_of(document),
         plan=document,
@@ -326,7 +322,7 @@ def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = (
                 *unreadable_ranges,
                 *_chosen(job, plan),
                 *_excluded(plan),
-                *found,
+                *destination_findings,
                 *_violations(results),
             )
         ),

@@ -259,12 +259,14 @@ def add_doubtful_digests(
 
     Such a file was either copied or changed between the samples.
     """
-    known = [source for record in (stored.records if stored else ()) for source in record.sources]
+    stored_sources = [source for record in (stored.records if stored else ()) for source in record.sources]
     doubtful = {
         source.content
         for source in provenance.sources
-        if any(one.content == source.content and one.whole for one in known)
-        and all((one.content, one.modified_ns) != (source.content, source.modified_ns) for one in known)
+        if any(one.content == source.content and one.whole for one in stored_sources)
+        and all(
+            (one.content, one.modified_ns) != (source.content, source.modified_ns) for one in stored_sources
+        )
     }
     return _add_full_digests(provenance, files, contents=doubtful) if doubtful else provenance
 
@@ -275,8 +277,8 @@ def _add_full_digests(
     """Add full digests to the local sources with one of these `contents`, by default to all of them."""
 
     def with_digest(source: Source, path: AnyPath) -> Source:
-        wanted = source.whole is None and (contents is None or source.content in contents)
-        if isinstance(path, RemotePath) or not wanted:
+        is_requested = source.whole is None and (contents is None or source.content in contents)
+        if isinstance(path, RemotePath) or not is_requested:
             return source
         return source.model_copy(update={"whole": full_digest(path)})
 
@@ -347,7 +349,7 @@ def _job_digest(plan: Plan) -> str:
 
 
 def _digest(path: Path, size: int, ranges: Iterable[tuple[int, int]]) -> str:
-    """Return a digest of the length of a file and of the ranges of it given as offset and length."""
+    """Return a digest of the length of a file and of some of its ranges, each an offset and a length."""
     digest = xxh3_128(size.to_bytes(8, "little"))
     buffer = memoryview(bytearray(_READ_BYTES))
     try:

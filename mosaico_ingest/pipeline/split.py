@@ -167,8 +167,10 @@ def _event_parts(
         )
         findings.append(Finding("event-outside", Severity.WARNING, message, event.span, hint))
     findings += overlaps(intervals)
-    for position, planned in enumerate(parts):
-        yield planned if position else replace(planned, part=replace(planned.part, findings=tuple(findings)))
+    if parts:
+        first, *others = parts
+        yield replace(first, part=replace(first.part, findings=tuple(findings)))
+        yield from others
 
 
 def _interval(event: Event, recording: Recording) -> tuple[int, int]:
