@@ -143,7 +143,7 @@ def print_runs(name: str, contracts: Contracts, runs: int) -> None:
 def print_checks(
     name: str, contracts: Contracts, runs: int, tracecheck: str | None, pymcap: str | None
 ) -> None:
-    """Print the wall time of `ingest check` and of the other tools."""
+    """Print the wall time and the CPU time of `ingest check` and of the other tools."""
     folder = contracts.folder
     commands: dict[str, list[str | Path]] = {
         "times": [*INGEST, "check", contracts.manifest("times", TIMES)],
@@ -158,7 +158,7 @@ def print_checks(
         commands["pymcap-cli"] = [pymcap, "check", contracts.recording, "--spec", contracts.pymcap()]
     figures = alternate(commands, runs, folder / "store")
     cells = [
-        f"{figures[key].wall_s:.2f} s" if key in figures else "-"
+        f"{figures[key].wall_s:.2f} s ({figures[key].cpu_s:.2f} s)" if key in figures else "-"
         for key in ("times", "tracecheck", "values", "pymcap-cli")
     ]
     print(f"| {name} | {' | '.join(cells)} |", flush=True)
@@ -183,7 +183,9 @@ def main() -> None:
         print("|---|---:|---:|---:|")
         for name, contracts in recordings.items():
             print_runs(name, contracts, arguments.runs)
-        print("\n| recording | check of times | tracecheck | check of ten fields | pymcap-cli |")
+        print(
+            "\nWall time (CPU time):\n\n| recording | check of times | tracecheck | check of ten fields | pymcap-cli |"
+        )
         print("|---|---:|---:|---:|---:|")
         for name, contracts in recordings.items():
             print_checks(name, contracts, arguments.runs, arguments.tracecheck, arguments.pymcap_cli)

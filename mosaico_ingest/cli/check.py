@@ -11,7 +11,7 @@ import typer
 from rich.text import Text
 
 from mosaico_ingest.cli.console import Terminal, print_json, print_line, read_sources, render_findings
-from mosaico_ingest.cli.options import JsonOption, JunitOption, SarifOption, write_output
+from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, JunitOption, SarifOption, write_output
 from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
@@ -21,18 +21,28 @@ if TYPE_CHECKING:
 
 def check(
     target: Annotated[
-        str, typer.Argument(metavar="JOB.yaml|SEQUENCE", help="A job manifest, or a sequence of --store.")
+        str,
+        typer.Argument(
+            metavar="JOB.yaml|SEQUENCE", help="A job manifest; with --expect, the name of a stored sequence."
+        ),
     ],
     *,
     store: Annotated[
         str | None,
         typer.Option(
-            "--store", help="Check a sequence of this store instead of recordings.", metavar="DIR|URL"
+            "--store",
+            help="With --expect: the folder or URL of the store.",
+            metavar="DIR|URL",
+            show_default=DEFAULT_STORE,
         ),
     ] = None,
     expect: Annotated[
         Path | None,
-        typer.Option("--expect", help="The file with the section expect, for --store.", metavar="FILE"),
+        typer.Option(
+            "--expect",
+            help="Check a stored sequence instead of recordings, against the section expect of this file.",
+            metavar="FILE",
+        ),
     ] = None,
     show_all: Annotated[
         bool, typer.Option("--all", "-a", help="Also print expectations that hold or are not evaluated.")
@@ -60,16 +70,16 @@ def check(
     from mosaico_ingest.report.model import gravest
 
     collect_garbage_as_usual()
-    if (store is None) != (expect is None):
-        raise typer.BadParameter("--store and --expect belong together", param_hint="--store, --expect")
+    if expect is None and store is not None:
+        raise typer.BadParameter("--store needs --expect FILE", param_hint="--store")
     checked: list[Checked] = []
-    jobs = api.compile_job(Path(target)) if store is None else ()
+    jobs = api.compile_job(Path(target)) if expect is None else ()
     if not (jobs and all(map(needs_times_only, jobs))):
         hide_pandas(jobs)
     results = (
         api.check_recordings(Path(target), jobs=jobs)
-        if store is None or expect is None
-        else [api.check_sequence(store, target, expect)]
+        if expect is None
+        else [api.check_sequence(store or DEFAULT_STORE, target, expect)]
     )
     for one in results:
         checked.append(one)

@@ -230,12 +230,10 @@ def limit_result(
     **details: Any,  # noqa: ANN401 - fields
 ) -> ExpectationResult:
     """Return the result of an expectation that limits a number or share of messages."""
-    is_good = count <= limit.count if limit.count is not None else count <= (limit.share or 0) * total
-    part = "" if limit.count is not None or not total else f" ({texts.share(count / total)})"
-    text = f"{count_text(count)} of {count_text(total)} {what}{part}; expected {texts.limit(limit)}"
-    measured = count if limit.count is not None else (count / total if total else 0.0)
-    unit = "messages" if limit.count is not None else "share"
-    details = {"measured": measured, "unit": unit, "limit": texts.limit(limit), **details}
+    is_good = limit.allows(count, total)
+    text = f"{texts.part(limit, count, total, what)}; expected {texts.limit(limit)}"
+    unit = "messages" if limit.share is None else "share"
+    details = {"measured": limit.measure(count, total), "unit": unit, "limit": texts.limit(limit), **details}
     return _result(clause, is_good, text, violations=0 if is_good else count, **details)
 
 

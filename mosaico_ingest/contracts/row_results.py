@@ -103,15 +103,10 @@ def _description(accumulators: Sequence[Any]) -> tuple[str, Any, str]:
 def _nulls(
     clause: Clause, limit: Limit, violations: Violations, total: int, subject: str
 ) -> ExpectationResult:
-    count = violations.count
-    is_good = count <= limit.count if limit.count is not None else count <= (limit.share or 0) * total
-    part = "" if limit.count is not None else f" ({texts.share(count / total)})"
-    text = f"{subject}: {count_text(count)} of {counted(total, 'value')} are null{part}; expected {texts.limit(limit)}"
-    measured = count if limit.count is not None else count / total
-    unit = "values" if limit.count is not None else "share"
-    if is_good:
-        return clause.passed(text, measured=measured, unit=unit, limit=texts.limit(limit))
-    return _from_violations(clause, violations, text, limit=texts.limit(limit), measured=measured, unit=unit)
+    part = texts.part(limit, violations.count, total, "values are null")
+    return _from_limit(
+        clause, limit, violations.count, total, violations, text=f"{subject}: {part}", unit="values"
+    )
 
 
 def _moments(clause: Clause, checks: Sequence[FieldCheck]) -> ExpectationResult:
@@ -201,15 +196,30 @@ def _header_numbers(clause: Clause, monitors: Sequence[RowMonitor]) -> Expectati
         return clause.skipped("the messages have no sequence numbers")
     missing = sum(one.missing for one in numbers)
     limit: Limit = clause.expected.missing
-    total = missing + count
-    is_good = missing <= limit.count if limit.count is not None else missing <= (limit.share or 0) * total
-    text = f"{count_text(missing)} of {count_text(total)} sequence numbers are missing; expected {texts.limit(limit)}"
-    measured = missing if limit.count is not None else missing / total
-    unit = "messages" if limit.count is not None else "share"
-    if is_good:
-        return clause.passed(text, measured=measured, unit=unit, limit=texts.limit(limit))
+    text = texts.part(limit, missing, missing + count, "sequence numbers are missing")
     violations = _worst([one.violations for one in numbers])
-    return _from_violations(clause, violations, text, limit=texts.limit(limit), measured=measured, unit=unit)
+    return _from_limit(clause, limit, missing, missing + count, violations, text=text, unit="messages")
+
+
+def _from_limit(
+    clause: Clause,
+    limit: Limit,
+    count: int,
+    total: int,
+    violations: Violations,
+    *,
+    text: str,
+    unit: str,
+) -> ExpectationResult:
+    """Return the result of an expectation that allows some violations."""
+    return _from_violations(
+        clause,
+        Violations() if limit.allows(count, total) else violations,
+        f"{text}; expected {texts.limit(limit)}",
+        limit=texts.limit(limit),
+        measured=limit.measure(count, total),
+        unit=unit if limit.share is None else "share",
+    )
 
 
 def _worst(violations: Sequence[Violations]) -> Violations:

@@ -156,6 +156,14 @@ class Limit(Struct, frozen=True):
     count: int | None = None
     share: float | None = None
 
+    def measure(self, count: int, total: int) -> float:
+        """Return what the limit applies to: the number, or its share of a total (0 if the total is 0)."""
+        return count if self.count is not None else (count / total if total else 0.0)
+
+    def allows(self, count: int, total: int) -> bool:
+        """Return whether a number, as part of a total, is within the limit."""
+        return count <= (self.count if self.count is not None else (self.share or 0) * total)
+
 
 class Interval(Struct, frozen=True):
     """A length of time: nanoseconds, or a multiple of a topic's period; the other attribute is None."""

@@ -190,6 +190,17 @@ def test_check_times_from_index_equal_times_of_messages(folder: Path) -> None:
             assert times[key].tolist() == expected.tolist()
 
 
+def test_check_command_with_expect_checks_default_store(
+    folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    text = PASSING.replace("target: {store: store}\n", "")
+    monkeypatch.chdir(folder)
+    run(folder, text)
+    assert exit_code("check", "drive", "--expect", "job.yaml") == 0
+    assert "drive: 2 expectations: 2 passed" in capsys.readouterr().out
+    assert exit_code("check", "drive", "--store", "mosaico") == 2
+
+
 def test_check_command_exit_codes_and_json(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code("check", str(write(folder, FAILING))) == 6
     assert "expectation-failed" in capsys.readouterr().out
