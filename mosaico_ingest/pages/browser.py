@@ -24,7 +24,7 @@ from mosaico_ingest.pages.design import render
 from mosaico_ingest.pages.reports import ReportFolder
 from mosaico_ingest.pages.run import run_page
 from mosaico_ingest.pages.sequence import sequence_page
-from mosaico_ingest.report.model import read_report
+from mosaico_ingest.report.files import read_report
 from mosaico_ingest.version import __version__
 
 HOST = "127.0.0.1"

@@ -9,7 +9,7 @@ from msgspec import Struct
 
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.pages.run import Verdict, verdict_of
-from mosaico_ingest.report.model import read_report
+from mosaico_ingest.report.files import LINES_SUFFIX, read_report
 
 MAX_RUNS = 200
 """Number of report files that are listed, the newest first."""
@@ -32,7 +32,7 @@ class RunSummary(Struct, frozen=True):
 
 
 class ReportFolder:
-    """The files `*.json` of a folder; a file is read again only if it changes."""
+    """The files `*.json` and `*.jsonl` of a folder; a file is read again only if it changes."""
 
     def __init__(self, path: Path) -> None:
         self.path = path
@@ -57,7 +57,7 @@ class ReportFolder:
     def _files(self) -> list[tuple[Path, Signature]]:
         """Return the files, the newest first."""
         files: list[tuple[Path, Signature]] = []
-        for path in self.path.glob("*.json"):
+        for path in (*self.path.glob("*.json"), *self.path.glob(f"*{LINES_SUFFIX}")):
             try:
                 state = path.stat()
             except OSError:  # deleted since it was listed
@@ -79,8 +79,8 @@ def _summary(path: Path) -> RunSummary:
         return RunSummary(path.stem, problem=str(error))
     return RunSummary(
         path.stem,
-        min((each.started_at for each in report.recordings), default=None),
+        report.summary.started_at,
         verdict_of(report.recordings),
-        sum(each.totals.written for each in report.recordings),
+        report.summary.written,
         tuple(dict.fromkeys(each.sequence for each in report.recordings)),
     )
