@@ -14,7 +14,7 @@ import yaml
 import zstandard
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.discovery import discover
+from mosaico_ingest.rosbag.discovery import discover, may_have_custom_data, parse_metadata
 from mosaico_ingest.rosbag.recording import open_recording
 
 BOMB = "\n".join(
@@ -296,3 +296,21 @@ def test_discover_ignores_hidden_files(split: Path) -> None:
     (split / "metadata.yaml").unlink()
     (split / "._part_8.mcap").write_bytes(b"what a Mac leaves")
     assert [file.name for file in discover([split]).files] == ["part_8.mcap", "part_9.mcap", "part_10.mcap"]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("version: 5\n", {}),
+        ("version: 9\ncustom_data: ~\n", {}),
+        ("rosbag2_bagfile_information:\n  custom_data: null\n", {}),
+        ("custom_data: {}\n", {}),
+        ("custom_data: {vehicle: r1}\n", {"vehicle": "r1"}),
+        ("custom_data:\n  vehicle: r1\n", {"vehicle": "r1"}),
+        ('"custom_data": {vehicle: ~}\n', {"vehicle": ""}),
+        ("ros_distro: |\n  custom_data: ~\ncustom_data: {vehicle: r1}\n", {"vehicle": "r1"}),
+    ],
+)
+def test_may_have_custom_data_is_false_only_without_custom_data(text: str, expected: dict[str, str]) -> None:
+    assert parse_metadata(text, Path("a.mcap"), is_embedded=True).custom_data == expected
+    assert may_have_custom_data(text) == bool(expected)
