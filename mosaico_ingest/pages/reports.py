@@ -21,7 +21,7 @@ class RunSummary(Struct, frozen=True):
     """One report file in the list."""
 
     name: str
-    """The name of the file without its suffix."""
+    """The name of the file."""
     started_at: datetime | None = None
     verdict: Verdict | None = None
     written: int = 0
@@ -40,12 +40,12 @@ class ReportFolder:
 
     def find(self, name: str) -> tuple[Path, Signature] | None:
         """Return a file of the folder by its name, which may come from anyone, with its signature."""
-        return next(((path, signature) for path, signature in self._files() if path.stem == name), None)
+        return next(((path, signature) for path, signature in self._files() if path.name == name), None)
 
     def summaries(self, text: str = "") -> list[RunSummary]:
         """Return the newest runs whose name, or the name of one of their sequences, contains a text."""
         summaries = {
-            path.stem: self._summary(path, signature) for path, signature in self._files()[:MAX_RUNS]
+            path.name: self._summary(path, signature) for path, signature in self._files()[:MAX_RUNS]
         }
         needle = text.casefold()
         return [
@@ -66,9 +66,9 @@ class ReportFolder:
         return sorted(files, key=lambda file: file[1], reverse=True)
 
     def _summary(self, path: Path, signature: Signature) -> RunSummary:
-        known = self._summaries.get(path.stem)
+        known = self._summaries.get(path.name)
         if known is None or known[0] != signature:
-            known = self._summaries[path.stem] = (signature, _summary(path))
+            known = self._summaries[path.name] = (signature, _summary(path))
         return known[1]
 
 
@@ -76,9 +76,9 @@ def _summary(path: Path) -> RunSummary:
     try:
         report = read_report(path)
     except IngestError as error:
-        return RunSummary(path.stem, problem=str(error))
+        return RunSummary(path.name, problem=str(error))
     return RunSummary(
-        path.stem,
+        path.name,
         report.summary.started_at,
         verdict_of(report.recordings),
         report.summary.written,

@@ -21,6 +21,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.pages.browser import PAGE_SIZE, BrowserServer, StoreBrowser, name_glob
 from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.report.files import report_text
 
 
 @pytest.fixture(scope="module")
@@ -168,12 +169,12 @@ def runs(tmp_path: Path) -> StoreBrowser:
 def test_browse_lists_runs_newest_first_with_their_pages_and_sequences(runs: StoreBrowser) -> None:
     html = runs.page("/runs").html
     links = Outline(html).links
-    assert [link for link in links if link.startswith("/run/")] == ["/run/tuesday", "/run/monday"]
+    assert [link for link in links if link.startswith("/run/")] == ["/run/tuesday.json", "/run/monday.json"]
     assert f"/sequence/{recording(3).sequence}" in links
     assert "The run failed" in html
     assert "damaged.json: is not a report" in html
     assert NASTY not in html
-    page = runs.page("/run/monday")
+    page = runs.page("/run/monday.json")
     assert page.status == 200
     assert "The run failed" in page.html
     assert "/runs" in Outline(page.html).links
@@ -181,27 +182,28 @@ def test_browse_lists_runs_newest_first_with_their_pages_and_sequences(runs: Sto
 
 def test_browse_search_selects_runs_by_sequence(runs: StoreBrowser) -> None:
     links = Outline(runs.page(f"/runs?q={recording(1).sequence.upper()}").html).links
-    assert [link for link in links if link.startswith("/run/")] == ["/run/monday"]
+    assert [link for link in links if link.startswith("/run/")] == ["/run/monday.json"]
 
 
 def test_browse_run_is_read_again_after_its_report_changed(runs: StoreBrowser, tmp_path: Path) -> None:
-    first = runs.page("/run/monday").html
-    assert runs.page("/run/monday").html is first
+    first = runs.page("/run/monday.json").html
+    assert runs.page("/run/monday.json").html is first
     file = tmp_path / "store" / "runs" / "monday.json"
     file.write_text(run(recording(1)).model_dump_json())
-    assert "Everything was stored" in runs.page("/run/monday").html
+    assert "Everything was stored" in runs.page("/run/monday.json").html
     assert "The run failed" not in runs.page("/runs").html
 
 
 def test_browse_damaged_report_states_the_reason(runs: StoreBrowser) -> None:
-    page = runs.page("/run/damaged")
+    page = runs.page("/run/damaged.json")
     assert page.status == 503
     assert "is not a report" in page.html
 
 
 def test_browse_lists_runs_of_another_folder(store: Store, tmp_path: Path) -> None:
-    (tmp_path / "night.json").write_text(run(recording(1)).model_dump_json())
-    assert "/run/night" in Outline(StoreBrowser(str(store.path), tmp_path).page("/runs").html).links
+    file = tmp_path / "night.jsonl"
+    file.write_text("".join(report_text(run(recording(1)), file)))
+    assert "/run/night.jsonl" in Outline(StoreBrowser(str(store.path), tmp_path).page("/runs").html).links
 
 
 def test_browse_missing_store_is_an_error(tmp_path: Path) -> None:
