@@ -17,7 +17,7 @@ from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.report.events import Noted, Observer
 from mosaico_ingest.report.units import bytes_text, counted
 from mosaico_ingest.rosbag.attachments import Attachment
-from mosaico_ingest.rosbag.recording import DAMAGED_RECORD_HELP, Recording
+from mosaico_ingest.rosbag.recording import DAMAGE_HELP, Recording
 
 RECORDS_KEY = "_records_"
 """Key of sequence metadata: the metadata records, each with its name and a list of keys and values."""
@@ -94,4 +94,4 @@ def attach_files(plan: Plan, recording: Recording, session: Session, observe: Ob
             attachable.attach(file, recording.attachment_chunks(attachment))
         except BagError as error:
             message = f"the attachment {attachment.name!r} is not stored: {error.what}"
-            observe(Noted(Finding("damaged-record", Severity.WARNING, message, help=DAMAGED_RECORD_HELP)))
+            observe(Noted(Finding("damaged-record", Severity.WARNING, message, help=DAMAGE_HELP)))

@@ -48,7 +48,7 @@ from mosaico_ingest.rosbag.blocks import (
     SplitReader,
     UnreadableRange,
 )
-from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_messages
+from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, MAX_CHUNK_KEY, decompress_messages
 from mosaico_ingest.rosbag.definitions.hashes import definition_difference
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
@@ -72,7 +72,7 @@ from mosaico_ingest.rosbag.opening import open_split
 
 BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
 """Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
-DAMAGED_RECORD_HELP = "copy the file again, or restore it from a backup"
+DAMAGE_HELP = "copy the file again, or restore it from a backup"
 _SMALL_RECORDING_BYTES = 1 << 20
 """Up to this size, reading the recording takes less time than starting a prefetch thread."""
 _MAX_READERS = 3
@@ -424,10 +424,11 @@ def damage_error(recording: Recording, what: str) -> BagError | None:
     if not recording.unreadable:
         return None
     damage = next((gap for gap in recording.unreadable if gap.count != 0), recording.unreadable[0])
+    is_refused = MAX_CHUNK_KEY in damage.reason
     return BagError(
         f"no {what} can be read: {damage.reason}",
         where=f"{damage.file or recording.files[0]}: at {damage.offset}",
-        hint="copy the file again, or restore it from a backup",
+        hint=f"raise {MAX_CHUNK_KEY} if you trust the recording" if is_refused else DAMAGE_HELP,
     )
 
 
@@ -583,7 +584,7 @@ def recording_findings(
         for gap in unreadable
     )
     findings += (
-        Finding("damaged-record", Severity.WARNING, f"{split.path}: {problem}", help=DAMAGED_RECORD_HELP)
+        Finding("damaged-record", Severity.WARNING, f"{split.path}: {problem}", help=DAMAGE_HELP)
         for split in splits
         if isinstance(split, HasAttachments)
         for problem in split.damaged_records()
