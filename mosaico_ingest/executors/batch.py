@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import uuid
 from collections import deque
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
@@ -14,6 +14,7 @@ from msgspec import Struct
 
 from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.errors import IngestError
+from mosaico_ingest.executors.groups import may_join
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.pipeline.task import Attempt, Task
@@ -44,6 +45,7 @@ class Batch:
     exhausted: bool = False
     """Whether no recording is left to take."""
     _retries: deque[int] = field(default_factory=deque[int])
+    """The recordings that were taken and have to start before others."""
     _reports: dict[int, Report] = field(default_factory=dict[int, Report])
     _started: int = 0
     _next: int = 0
@@ -67,6 +69,27 @@ class Batch:
                 return None
         self.exhausted = True
         return None
+
+    def take_group(self, size: int) -> list[int]:
+        """Return the positions of at most `size` recordings to start in one process, empty if none can start now.
+
+        A recording that is large, depends on others, or was started before is alone.
+        """
+        group: list[int] = []
+        while len(group) < size and (position := self.take()) is not None:
+            is_alone = position in self.attempts or not may_join(self.tasks[position].job)
+            if group and is_alone:
+                self._retries.appendleft(position)
+                break
+            group.append(position)
+            if is_alone:
+                break
+        return group
+
+    def drop(self, positions: Iterable[int]) -> None:
+        """Give up recordings that were not started; they have no report."""
+        for position in positions:
+            del self.tasks[position]
 
     def stop(self) -> None:
         """Take no more recordings."""
@@ -97,9 +120,9 @@ class Batch:
         """Store the report of a recording that could not run."""
         self.finish(position, failed_report(self.tasks[position], error, partial(self.observe, position)))
 
-    def retry(self, position: int) -> None:
-        """Start a recording again, before others."""
-        self._retries.appendleft(position)
+    def retry(self, positions: Sequence[int]) -> None:
+        """Start recordings again, before others."""
+        self._retries.extendleft(reversed(positions))
 
     def reports(self) -> Iterator[Report]:
         """Yield the next reports in order, up to the first recording that is not finished."""

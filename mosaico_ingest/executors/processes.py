@@ -6,7 +6,7 @@ import multiprocessing
 import os
 import pickle
 import signal
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
 from functools import partial
@@ -20,12 +20,12 @@ from msgspec import Struct, structs
 
 from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
-from mosaico_ingest.executors.base import do_nothing
+from mosaico_ingest.executors.base import InProcess, do_nothing
 from mosaico_ingest.executors.batch import Batch, Registrations
 from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.memory import MemoryBudget
-from mosaico_ingest.pipeline.run import failed_report, run_recording
+from mosaico_ingest.pipeline.run import failed_report
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
@@ -34,6 +34,8 @@ ATTEMPTS = 2
 """Number of times a recording is started if its worker process dies."""
 _SHUTDOWN_S = 10.0
 """Seconds that a worker has to end before it is killed."""
+_MAX_GROUP = 32
+"""Maximum number of recordings that a worker receives at a time."""
 _POLL_S = 0.2
 """Seconds between two checks for a request to stop."""
 _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM)
@@ -44,8 +46,9 @@ _SIGKILL = 9
 class Processes(Struct, frozen=True):
     """The executor for one machine: up to `processes` recordings at a time, each in a worker process.
 
-    If a worker dies, its recording is started again, up to `attempts` times in total; other recordings are not affected.
-    The memory budget of the jobs is split among the workers. Each worker calls `prepare` first, for example to configure
+    A worker receives several small recordings at a time, which it commits together; the number doubles from one group to
+    the next, so that all workers end at about the same time. If a worker dies, its recordings are started again, each
+    alone and up to `attempts` times in total; other recordings are not affected. The memory budget of the jobs is split among the workers. Each worker calls `prepare` first, for example to configure
     logging.
     """
 
@@ -72,11 +75,16 @@ class Processes(Struct, frozen=True):
 
 @dataclass(slots=True)
 class _Worker:
-    """A worker process, the parent's end of its pipe, and the position of the recording it runs."""
+    """A worker process, the parent's end of its pipe, and the recordings it runs."""
 
     process: SpawnProcess
     pipe: Connection
-    task: int | None = None
+    group_size: int = 1
+    """Maximum number of recordings that it receives next."""
+    group: tuple[int, ...] = ()
+    """The positions of the recordings that it received, empty if it is idle."""
+    unfinished: dict[int, bool] = field(default_factory=dict[int, bool])
+    """The positions of those without a report, in order, and whether they were started."""
 
 
 @dataclass(slots=True)
@@ -91,7 +99,7 @@ class _Pool:
 
     def reports(self, interrupts: list[int]) -> Iterator[Report]:
         """Yield reports in order, each as soon as the ones before it are finished."""
-        while self.batch.is_waiting or any(worker.task is not None for worker in self.workers):
+        while self.batch.is_waiting or any(worker.group for worker in self.workers):
             self._assign()
             self._poll()
             if len(interrupts) > self.interrupts:
@@ -102,7 +110,7 @@ class _Pool:
     def shut_down(self) -> None:
         """End every worker: idle ones by closing their pipes, busy ones by an interrupt."""
         for worker in self.workers:
-            if worker.task is not None:
+            if worker.group:
                 _signal(worker, signal.SIGINT)
             worker.pipe.close()
         for worker in self.workers:
@@ -112,68 +120,96 @@ class _Pool:
                 worker.process.join()
 
     def _assign(self) -> None:
-        while self._has_capacity() and (task := self.batch.take()) is not None:
-            worker = next((worker for worker in self.workers if worker.task is None), None)
+        while len(self.workers) < self.size or any(not worker.group for worker in self.workers):
+            worker = next((worker for worker in self.workers if not worker.group), None)
+            group = self.batch.take_group(1 if worker is None else worker.group_size)
+            if not group:
+                return
             if worker is None:
                 worker = self.spawn()
                 self.workers.append(worker)
-            self._send(worker, task)
+            self._send(worker, group)
 
-    def _has_capacity(self) -> bool:
-        return len(self.workers) < self.size or any(worker.task is None for worker in self.workers)
-
-    def _send(self, worker: _Worker, task: int) -> None:
+    def _send(self, worker: _Worker, group: Sequence[int]) -> None:
+        tasks = [
+            structs.replace(self.batch.tasks[position], attempt=self.batch.start(position))
+            for position in group
+        ]
         try:
-            pickled = ForkingPickler.dumps(
-                structs.replace(self.batch.tasks[task], attempt=self.batch.start(task))
-            )
+            pickled = ForkingPickler.dumps(tasks)
         except Exception as error:  # noqa: BLE001 - pickling runs the code of the job's classes
-            self.batch.fail(task, _unsendable(error))
+            self._separate(group, _unsendable(error))
             return
-        worker.task = task
+        worker.group = tuple(group)
+        worker.unfinished = dict.fromkeys(group, False)
+        worker.group_size = min(2 * worker.group_size, _MAX_GROUP)
         with suppress(BrokenPipeError):  # `_receive` notices that the process is gone
             worker.pipe.send_bytes(pickled)
 
     def _poll(self) -> None:
-        busy = [worker.pipe for worker in self.workers if worker.task is not None]
-        skips = self._has_capacity() and not self.batch.exhausted  # and has more recordings to skip
-        ready = set(wait(busy, 0 if skips else _POLL_S)) if busy else set[object]()
+        busy = [worker.pipe for worker in self.workers if worker.group]
+        is_skipping = len(busy) < self.size and not self.batch.exhausted
+        ready = set(wait(busy, 0 if is_skipping else _POLL_S)) if busy else set[object]()
         for worker in self.workers[:]:
-            if worker.task is not None and worker.pipe in ready:
-                self._receive(worker, worker.task)
+            if worker.group and worker.pipe in ready:
+                self._receive(worker)
 
-    def _receive(self, worker: _Worker, task: int) -> None:
+    def _receive(self, worker: _Worker) -> None:
         try:
             message = worker.pipe.recv()
         except (EOFError, OSError):
-            self._handle_death(worker, task)
+            self._handle_death(worker)
             return
-        if isinstance(message, Report):
-            worker.task = None
-            self.batch.finish(task, message)
-        elif isinstance(message, IngestError):
-            worker.task = None
-            self.batch.fail(task, message)
+        if isinstance(message, IngestError):
+            self._separate(worker.group, message)
+            worker.group = ()
+        elif message is None:
+            self._handle_end(worker)
         else:
-            self.batch.tell(task, message)
+            number, content = message
+            position = worker.group[number]
+            if isinstance(content, Report):
+                del worker.unfinished[position]
+                self.batch.finish(position, content)
+            else:
+                worker.unfinished[position] = True
+                self.batch.tell(position, content)
 
-    def _handle_death(self, worker: _Worker, task: int) -> None:
-        """Remove a worker that died; start its recording again, or report it as failed."""
+    def _separate(self, group: Sequence[int], error: IngestError) -> None:
+        """Send the recordings of a group that cannot be pickled one by one, to find the one that has the error."""
+        if len(group) == 1:
+            self.batch.fail(group[0], error)
+        else:
+            self.batch.retry(group)
+
+    def _handle_end(self, worker: _Worker) -> None:
+        """Make a worker idle; an interrupted worker does not start all recordings of its group."""
+        if self.interrupts:
+            self.batch.drop(worker.unfinished)
+        else:
+            self.batch.retry(tuple(worker.unfinished))
+        worker.group = ()
+
+    def _handle_death(self, worker: _Worker) -> None:
+        """Remove a worker that died; start its recordings again one by one, or report them as failed."""
         worker.process.join()
         worker.pipe.close()
         self.workers.remove(worker)
-        if self.interrupts:
-            self.batch.fail(task, Interrupted("stopped before the end of the recording"))
-        elif self.batch.attempts[task] < self.attempts:
-            self.batch.retry(task)
-        else:
-            self.batch.fail(task, _worker_died(worker.process.exitcode, self.attempts))
+        for position, is_started in reversed(worker.unfinished.items()):
+            if self.interrupts and is_started:
+                self.batch.fail(position, Interrupted("stopped before the end of the recording"))
+            elif self.interrupts:
+                self.batch.drop([position])
+            elif len(worker.group) > 1 or self.batch.attempts[position] < self.attempts:
+                self.batch.retry([position])
+            else:
+                self.batch.fail(position, _worker_died(worker.process.exitcode, self.attempts))
 
     def _interrupt(self) -> None:
         """Start no more recordings and interrupt the running ones; a second interrupt kills them."""
         self.batch.stop()
         for worker in self.workers:
-            if worker.task is not None:
+            if worker.group:
                 if self.interrupts:
                     worker.process.kill()
                 else:
@@ -195,29 +231,36 @@ def work(pipe: Connection, registrations: Registrations, prepare: Callable[[], N
     registrations.register()
     with keep_destinations_open() as keep_open, suppress(EOFError, BrokenPipeError, ConnectionResetError):
         while not stop.requested:
-            _run_job(pipe, pipe.recv_bytes(), stop, keep_open)
+            _run_tasks(pipe, pipe.recv_bytes(), stop, keep_open)
 
 
-def _run_job(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: KeepOpen) -> None:
-    def tell(event: Event) -> None:
+def _run_tasks(pipe: Connection, pickled: bytes, stop: StopHandler, keep_open: KeepOpen) -> None:
+    def send(number: int, content: Event | Report) -> None:
         stop.disable()  # an interrupt in the middle of a message would leave half of it in the pipe
         # `pipe.send` would leave a view of a BytesIO in the traceback, whose collection crashes CPython before 3.12.3.
-        pipe.send_bytes(pickle.dumps(event))
+        pipe.send_bytes(pickle.dumps((number, content)))
+
+    def tell(number: int, event: Event) -> None:
+        send(number, event)
         stop.enable()
 
     try:
-        task: Task = pickle.loads(pickled)  # noqa: S301 - from our own parent
+        tasks: list[Task] = pickle.loads(pickled)  # noqa: S301 - from our own parent
     except Exception as error:  # noqa: BLE001 - unpickling runs the code of the job's classes
         pipe.send(IngestError(f"the job cannot be read in another process: {type(error).__name__}: {error}"))
         return
+    finished = 0
     try:
         stop.enable()
-        report = run_recording(task, tell).report
+        for report in InProcess().map(tasks, tell):
+            send(finished, report)
+            finished += 1
     except KeyboardInterrupt:
-        report = failed_report(task, Interrupted("stopped before the recording was opened"), tell)
+        error = Interrupted("stopped before the recording was opened")
+        send(finished, failed_report(tasks[finished], error, partial(tell, finished)))
     stop.disable()
-    pipe.send(report)
-    keep_open(task.job.destination)
+    pipe.send(None)
+    keep_open(tasks[-1].job.destination)
 
 
 def _spawn_worker(prepare: Callable[[], None], processes: int) -> _Worker:

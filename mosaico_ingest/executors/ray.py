@@ -192,7 +192,7 @@ class _Run:
             _log.warning(
                 "%s is started again: %s", self.batch.tasks[position].job.sequence.name, _first_line(error)
             )
-            self.batch.retry(position)
+            self.batch.retry([position])
         else:
             self.batch.fail(position, _died(error, self.batch.attempts[position]))
 

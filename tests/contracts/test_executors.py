@@ -228,6 +228,15 @@ def test_executor_dead_worker_fails_only_its_recording(elsewhere: Executor, tmp_
     assert Store.open(tmp_path / "store").names() == ("a", "c")
 
 
+def test_executor_dead_worker_fails_only_its_recording_of_a_group(tmp_path: Path) -> None:
+    jobs = tasks(tmp_path, "abcdefgh")
+    jobs[6] = tasks(tmp_path, "g", adapter_override={"/imu": Killer})[0]
+    reports = list(Processes(2).map(jobs, ignore_batch))
+    assert [report.exit_code for report in reports] == [0, 0, 0, 0, 0, 0, 1, 0]
+    assert [report.totals.written for report in reports] == [1000, 1000, 1000, 1000, 1000, 1000, 0, 1000]
+    assert Store.open(tmp_path / "store").names() == tuple("abcdefh")
+
+
 def test_executor_killed_worker_hints_at_memory(tmp_path: Path) -> None:
     jobs = [*tasks(tmp_path, "a", adapter_override={"/imu": Killer}), *tasks(tmp_path, "b")]
     reports = list(Processes(2).map(jobs, ignore_batch))
@@ -270,10 +279,11 @@ def test_executor_unpicklable_configuration_fails_with_a_hint(tmp_path: Path) ->
     class Local(Refusing):
         pass
 
-    jobs = [*tasks(tmp_path, "a", adapter_override={"/imu": Local}), *tasks(tmp_path, "b")]
+    jobs = tasks(tmp_path, "abcdefgh")
+    jobs[5] = tasks(tmp_path, "f", adapter_override={"/imu": Local})[0]
     reports = list(Processes(2).map(jobs, ignore_batch))
-    assert [report.exit_code for report in reports] == [1, 0]
-    assert "top level of a module" in (reports[0].error or "")
+    assert [report.exit_code for report in reports] == [0, 0, 0, 0, 0, 1, 0, 0]
+    assert "top level of a module" in (reports[5].error or "")
 
 
 def test_executor_interrupt_applies_the_session_policy_in_every_process(tmp_path: Path) -> None:
@@ -317,9 +327,9 @@ def test_worker_that_loses_its_parent_discards_its_session(tmp_path: Path) -> No
         topics_on_error="ignore",
     )
     worker = _spawn_worker(do_nothing, 1)
-    worker.pipe.send_bytes(ForkingPickler.dumps(job))
+    worker.pipe.send_bytes(ForkingPickler.dumps([job]))
     while True:
-        event = worker.pipe.recv()
+        _number, event = worker.pipe.recv()
         if isinstance(event, TopicProgress) and event.written:
             break
     worker.pipe.close()

@@ -20,10 +20,10 @@ from mosaico_ingest.destinations.store import Store
 from .conftest import WriteBag, number
 
 WriteJob = Callable[..., Path]
-NAMES = ("one", "two", "three")
+NAMES = ("one", "two", "three", "four", "five", "six")
 TOPICS = tuple(f"/speed_{number}" for number in range(40))
-ROWS = 5000
-"""Rows per topic; many topics make many events, each of which may meet a broken pipe."""
+ROWS = 1500
+"""Rows per topic; many topics make many events, each of which may meet a broken pipe. Small recordings are grouped."""
 VICTIMS = ("parent", "worker", "parent", "both")
 
 
@@ -89,7 +89,7 @@ def content(store: Path) -> dict[str, float]:
 
 
 def kill_and_look(write_bag: WriteBag, job: Path, store: Path, rounds: int) -> dict[str, set[bool]]:
-    """Write or replace three sequences repeatedly and kill processes of each run.
+    """Write or replace sequences repeatedly and kill processes of each run.
 
     Return per victim whether sequences were written before the kill.
     """
