@@ -10,6 +10,7 @@ import ast
 import re
 import warnings
 from collections.abc import Callable
+from functools import cached_property
 from typing import TypeAlias, cast
 
 from msgspec import Struct
@@ -35,7 +36,7 @@ class ExpressionError(Exception):
         self.hint = hint
 
 
-class ExpressionNode(Struct, frozen=True, eq=False):
+class ExpressionNode(Struct, frozen=True, eq=False, dict=True):
     """A node of an expression; comparisons ignore positions, texts and derived types."""
 
     def __eq__(self, other: object) -> bool:
@@ -44,6 +45,10 @@ class ExpressionNode(Struct, frozen=True, eq=False):
 
     def __hash__(self) -> int:
         """Return a hash of the content."""
+        return self._hash
+
+    @cached_property
+    def _hash(self) -> int:
         return hash((type(self), self._content()))
 
     def _content(self) -> tuple[object, ...]:
