@@ -90,9 +90,7 @@ def _gap(clause: Clause, members: Sequence[Member]) -> ExpectationResult:
         if stop > end:
             end, previous = stop, name
     if not longest:
-        return clause.passed(
-            f"no interval is missing; expected gaps of {limit}", measured=0, unit="ns", limit=limit
-        )
+        return clause.passed(f"no interval is missing; expected {limit}", measured=0, unit="ns", limit=limit)
     text = f"{texts.duration(longest)} are missing between {before} and {after}; expected {limit}"
     if not bad:
         return clause.passed(text, measured=longest, unit="ns", limit=limit)

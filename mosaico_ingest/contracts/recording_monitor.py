@@ -56,7 +56,7 @@ class RecordingMonitor:
         self._outputs: dict[str, TopicMonitor | None] = {}
         """The monitors of the outputs of adapters; None if nothing is expected of an output."""
         self._output_types: dict[str, dict[str, None]] = {}
-        """The message types that each output is made of."""
+        """The message types whose messages each output has rows of."""
         self._outputs_of: dict[int, tuple[TopicMonitor | None, ...]] = {}
         """The monitors of the outputs of each connection, if something is expected of one of them."""
         references = referenced_topics(contract)
