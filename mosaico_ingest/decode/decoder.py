@@ -99,7 +99,7 @@ class ColumnarDecoder:
             return replace(none, failures=(RowFailure(0, "too-large", reason),))
         middle = int(np.searchsorted(np.cumsum(block.lengths), total // 2)) + 1
         edges = (0, min(middle, len(block) - 1), len(block))
-        first, second = (self.decode(block.rows(slice(begin, end))) for begin, end in pairwise(edges))
+        first, second = (self.decode(block.rows(slice(start, end))) for start, end in pairwise(edges))
         try:
             rows = pa.concat_arrays([first.rows, second.rows])
         except pa.ArrowInvalid as error:

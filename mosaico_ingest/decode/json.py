@@ -39,8 +39,9 @@ class JsonDecoder:
         self._confirm = None if kind is None else msgspec.json.Decoder(kind)
         self._codec = JsonCodec(definition)
         self._columns = self._codec.columns
-        self._schema = None if self._columns.contains("json") else _parsed_schema(self._columns)
-        """The types that pyarrow parses; None if a column is JSON text, which pyarrow cannot produce."""
+        has_parser = bool(self._columns.fields) and not self._columns.contains("json")
+        self._schema = _parsed_schema(self._columns) if has_parser else None
+        """The types that pyarrow parses; None without columns, or if a column is JSON text, which pyarrow cannot produce."""
 
     @property
     def shape(self) -> pa.StructType:
@@ -101,19 +102,17 @@ class JsonDecoder:
         # A line break in a valid message is white space.
         lines = b"\n".join(payload.replace(b"\n", b" ") for payload in payloads)
         options = ParseOptions(explicit_schema=self._schema, unexpected_field_behavior="infer")
+        undeclared: set[str] = set()
         try:
             table = read_json(
                 io.BytesIO(lines), ReadOptions(use_threads=False, block_size=len(lines) + 1), options
             )
-        except (pa.ArrowException, ValueError):
-            return None
-        if table.num_rows != len(payloads):
-            return None
-        undeclared: set[str] = set()
-        rows = table.combine_chunks().to_struct_array().combine_chunks()
-        try:
+            if table.num_rows != len(payloads):
+                return None
+            # pyarrow builds invalid arrays of lists of nulls in fields without a column.
+            rows = table.combine_chunks().to_struct_array().combine_chunks()
             shaped = _shaped(rows, self._columns, self._shape, "$", undeclared)
-        except ValueError:
+        except (pa.ArrowException, ValueError):
             return None
         index = np.arange(len(payloads), dtype=np.int64)
         return Decoded(shaped, index, (), undeclared=frozenset(undeclared))

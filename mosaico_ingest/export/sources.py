@@ -74,7 +74,7 @@ class StoreSequence:
     """A sequence of the embedded store."""
 
     def __init__(self, store: Store, name: str) -> None:
-        """Look the sequence up.
+        """Look up the sequence.
 
         Raises:
             SinkError: The sequence does not exist.
@@ -99,7 +99,7 @@ class ServerSequence:
     """A sequence of a Mosaico server. Its rows are streamed; each topic holds one message of the server at a time."""
 
     def __init__(self, client: ServerClient, name: str) -> None:
-        """Look the sequence and its topics up.
+        """Look up the sequence and its topics.
 
         Raises:
             SinkError: The sequence does not exist, or the server refuses the request.

@@ -156,6 +156,7 @@ _OTHERS = {
     "Serializable": "model",
     "SerializationFormat": "types",
 }
+"""The module of each name that is not a tag."""
 
 
 def __getattr__(name: str) -> Any:  # noqa: ANN401 - any of the names
