@@ -86,10 +86,10 @@ class AzureFiles(FileSystemHandler):
         except FileNotFoundError:
             return None
 
-    def read(self, path: str, start: int, stop: int) -> bytes:
+    def read_range(self, path: str, start: int, end: int) -> bytes:
         """Return a range of a blob."""
         with _translated_errors(path):
-            return bytes(obstore.get_range(self._store, _blob(path), start=start, end=stop))
+            return bytes(obstore.get_range(self._store, _blob(path), start=start, end=end))
 
     def get_type_name(self) -> str:
         """Return the name of the type of file system."""
@@ -163,7 +163,7 @@ class _Input(RangedFile):
         self._path = path
 
     def fetch(self, start: int, end: int) -> bytes:
-        return self._files.read(self._path, start, end)
+        return self._files.read_range(self._path, start, end)
 
 
 class _Output(RawIOBase):

@@ -14,7 +14,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import timedelta
 from fnmatch import fnmatchcase
-from functools import lru_cache
+from functools import lru_cache, partial
 from pathlib import Path
 from stat import S_IFDIR, S_IFREG
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -373,12 +373,24 @@ class RemotePath:
             properties = self._properties(cached=True)
         return properties is None or properties.has_ranges
 
+    def range_reader(self, file: pa.NativeFile) -> Callable[[int, int], bytes]:
+        """Return a function that returns a range of the open file; several threads can call it at the same time."""
+        if self._handler is None or not self.has_ranges:
+            return partial(_read_at, file)
+        return partial(
+            self._handler.read_range, self.filesystem_path
+        )  # a file in Python reads one range at a time
+
+    @property
+    def _handler(self) -> Any:  # noqa: ANN401 - `WebFiles` and `AzureFiles` are imported lazily
+        """The file system in Python, None for those of pyarrow itself."""
+        return getattr(self.filesystem, "handler", None)
+
     def _properties(self, *, cached: bool) -> Properties | None:
         """Return the properties of the file, None for the file systems of pyarrow itself."""
-        handler: Any = getattr(self.filesystem, "handler", None)
-        if handler is None:
+        if self._handler is None:
             return None
-        properties = handler.properties(self.filesystem_path, cached=cached)
+        properties = self._handler.properties(self.filesystem_path, cached=cached)
         if properties is None:
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(self))
         return properties
@@ -476,6 +488,10 @@ def parse_url(text: str) -> AnyPath:
     if isinstance(path, RemotePath) and not path.is_web:
         _options(path.root, path.options, SCHEMES[path.root.partition("://")[0]][1])
     return path
+
+
+def _read_at(file: pa.NativeFile, start: int, stop: int) -> bytes:
+    return file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs lack the arguments
 
 
 def _stat(info: FileInfo) -> RemoteStat | None:

@@ -113,6 +113,14 @@ class WebFiles(FileSystemHandler):
         self._properties[path] = time.monotonic(), properties
         return properties
 
+    def read_range(self, path: str, start: int, end: int) -> bytes:
+        """Return a range of a file of a server that sends ranges."""
+        response, where = self.request(path, start, end)
+        try:
+            return b"" if response.status == _UNSATISFIABLE else self.read(response, where, end - start)
+        finally:
+            _discard(response)
+
     def read(self, response: Any, where: str, count: int) -> bytes:  # noqa: ANN401 - a response of urllib3
         """Return the next bytes of a response.
 
@@ -231,7 +239,9 @@ class _WebFile(RangedFile):
         """Number of bytes read from the response."""
 
     def fetch(self, start: int, end: int) -> bytes:
-        return self._read_range(start, end) if self._has_ranges else self._read_on(start, end)
+        if self._has_ranges:
+            return self._files.read_range(self._path, start, end)
+        return self._read_on(start, end)
 
     def close(self) -> None:
         self._drop_response()
@@ -241,15 +251,6 @@ class _WebFile(RangedFile):
         if self._complete is not None:
             _discard(self._complete[0])
             self._complete = None
-
-    def _read_range(self, start: int, end: int) -> bytes:
-        response, where = self._files.request(self._path, start, end)
-        try:
-            if response.status == _UNSATISFIABLE:
-                return b""
-            return self._files.read(response, where, end - start)
-        finally:
-            _discard(response)
 
     def _read_on(self, start: int, end: int) -> bytes:
         """Read from the response with the complete file; request it again if its position is after the range."""

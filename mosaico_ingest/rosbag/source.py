@@ -319,6 +319,7 @@ class RemoteSource:
         self._pages: deque[_Range] = deque(maxlen=_CACHED_PAGES)
         try:
             self._file = path.open_input()
+            self._read_range = path.range_reader(self._file)
             self.has_ranges = path.has_ranges
             """Whether the server sends ranges; otherwise, each range costs the bytes before it."""
             with translate_errors(str(path)):
@@ -401,7 +402,7 @@ class RemoteSource:
         """Fetch a range with one request."""
         try:
             with translate_errors(str(self.path)):
-                data = self._file.read_at(stop - start, start)  # pyright: ignore[reportCallIssue] - the stubs lack the arguments
+                data = self._read_range(start, stop)
         except Unreachable:
             raise
         except Exception:
@@ -488,6 +489,8 @@ class _Prefetcher:
     def __init__(self, fetch: Callable[[int, int], bytes], ranges: Iterator[tuple[int, int]]) -> None:
         self._fetch = fetch
         self._ranges = ranges
+        self._following = next(ranges, None)
+        """The next range that is not requested yet."""
         self._requests: deque[tuple[int, int, Future[bytes]]] = deque()
         self._allowed = 1
         self._pool = ThreadPoolExecutor(_CONCURRENT_REQUESTS, thread_name_prefix="mosaico-fetch")
@@ -497,6 +500,8 @@ class _Prefetcher:
     def take(self, start: int, stop: int) -> bytes | None:
         """Return a range if it was announced, else None."""
         with self._lock:
+            if self._following and self._following[0] <= start and stop <= self._following[1]:
+                self._submit(self._following)
             index = next((i for i, (a, b, _) in enumerate(self._requests) if a <= start and stop <= b), None)
             if index is None:
                 return None
@@ -513,11 +518,12 @@ class _Prefetcher:
         self._pool.shutdown(wait=True, cancel_futures=True)
 
     def _fill(self) -> None:
-        while len(self._requests) < self._allowed:
-            following = next(self._ranges, None)
-            if following is None:
-                return
-            self._requests.append((*following, self._pool.submit(self._fetch, *following)))
+        while self._following and len(self._requests) < self._allowed:
+            self._submit(self._following)
+
+    def _submit(self, request: tuple[int, int]) -> None:
+        self._requests.append((*request, self._pool.submit(self._fetch, *request)))
+        self._following = next(self._ranges, None)
 
 
 def _requests(ranges: Iterator[tuple[int, int]]) -> Iterator[tuple[int, int]]:

@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import json
 import random
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from typing import Any
 
 import pytest
 from made_recordings import define, record
@@ -20,6 +23,8 @@ from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
+from mosaico_ingest.rosbag.source import _Prefetcher
+from mosaico_ingest.web_files import WebFiles
 
 BLOB = define("made/msg/Blob", "uint8[] data")
 SECRET = "0badc0ffee"  # noqa: S105 - not a password
@@ -79,6 +84,51 @@ def test_inspecting_mcap_of_web_server_reads_a_small_part(server: WebServer, tmp
     with open_recording(remote(server, "large.mcap"), resolve=TypeResolver(None)) as opened:
         assert opened.message_count == 4
     assert server.sent_bytes < len(server.files["large.mcap"]) / 4
+
+
+def test_reading_mcap_of_web_server_merges_chunks(server: WebServer, tmp_path: Path) -> None:
+    generator = random.Random(1)  # noqa: S311 - incompressible content
+    payloads = [list(generator.randbytes(1_200_000)) for _ in range(12)]
+    messages = [("/blob", BLOB, second, {"data": payload}) for second, payload in enumerate(payloads)]
+    path = record(tmp_path / "large.mcap", messages)
+    server.files["large.mcap"] = path.read_bytes()
+    with open_recording(remote(server, "large.mcap"), resolve=TypeResolver(None)) as opened:
+        server.requests.clear()
+        assert sum(map(len, opened.message_blocks())) == len(messages)
+    assert len(server.requests) <= 8
+
+
+def test_ranges_of_web_server_are_read_concurrently(
+    server: WebServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    both = threading.Barrier(2, timeout=20)
+    original = WebFiles.read_range
+
+    def read_range(*arguments: Any) -> bytes:
+        both.wait()
+        return original(*arguments)
+
+    monkeypatch.setattr(WebFiles, "read_range", read_range)
+    server.files["a.mcap"] = b"content"
+    path = remote(server, "a.mcap")
+    with path.open_input() as file, ThreadPoolExecutor(2) as pool:
+        assert list(pool.map(path.range_reader(file), (0, 4), (3, 7))) == [b"con", b"ent"]
+
+
+def test_prefetcher_requests_the_following_range_while_one_is_read() -> None:
+    both = threading.Barrier(2, timeout=20)
+
+    def fetch(start: int, stop: int) -> bytes:
+        if start:
+            both.wait()
+        return bytes(range(start, stop))
+
+    prefetcher = _Prefetcher(fetch, iter([(0, 10), (10, 20), (20, 30)]))
+    assert prefetcher.take(2, 10) == bytes(range(2, 10))
+    assert prefetcher.take(40, 50) is None
+    assert prefetcher.take(10, 20) == bytes(range(10, 20))
+    assert prefetcher.take(20, 30) == bytes(range(20, 30))
+    prefetcher.close()
 
 
 def test_read_retries_server_errors(server: WebServer) -> None:
