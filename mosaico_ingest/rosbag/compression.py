@@ -22,7 +22,7 @@ from mosaico_ingest.containers import ZSTD
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import Bytes, MessageBlock, UnreadableRange, fixed_slices
 
-MAX_CHUNK_KEY = "bag.max_chunk_size"
+CHUNK_LIMIT_KEY = "bag.max_chunk_size"
 """The manifest key of the limit, which messages name."""
 MAX_CHUNK_BYTES = 256 << 20
 """Default limit for the decompressed size of a chunk."""
@@ -91,7 +91,7 @@ def is_plain(compression: str) -> bool:
 def check_chunk_size(compression: str, size: int, limit: int) -> None:
     """Raise BagError if a compressed chunk declares more than `limit` bytes."""
     if size > limit and not is_plain(compression):
-        raise BagError(f"{size} bytes announced, more than the {limit} bytes of {MAX_CHUNK_KEY}")
+        raise BagError(f"{size} bytes announced, more than the {limit} bytes of {CHUNK_LIMIT_KEY}")
 
 
 def decompress(

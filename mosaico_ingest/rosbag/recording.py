@@ -48,7 +48,7 @@ from mosaico_ingest.rosbag.blocks import (
     SplitReader,
     UnreadableRange,
 )
-from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, MAX_CHUNK_KEY, decompress_messages
+from mosaico_ingest.rosbag.compression import CHUNK_LIMIT_KEY, MAX_CHUNK_BYTES, decompress_messages
 from mosaico_ingest.rosbag.definitions.hashes import definition_difference
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
@@ -424,11 +424,11 @@ def damage_error(recording: Recording, what: str) -> BagError | None:
     if not recording.unreadable:
         return None
     damage = next((gap for gap in recording.unreadable if gap.count != 0), recording.unreadable[0])
-    is_refused = MAX_CHUNK_KEY in damage.reason
+    is_refused = CHUNK_LIMIT_KEY in damage.reason
     return BagError(
         f"no {what} can be read: {damage.reason}",
         where=f"{damage.file or recording.files[0]}: at {damage.offset}",
-        hint=f"raise {MAX_CHUNK_KEY} if you trust the recording" if is_refused else DAMAGE_HELP,
+        hint=f"raise {CHUNK_LIMIT_KEY} if you trust the recording" if is_refused else DAMAGE_HELP,
     )
 
 
