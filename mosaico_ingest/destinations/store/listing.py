@@ -25,7 +25,7 @@ class SequenceFilter(Struct, frozen=True):
     incomplete: bool = False
     """Select only sequences whose last run ended with an error, or that no run finished."""
 
-    def selects(self, info: SequenceInfo) -> bool:
+    def selects(self, info: SequenceInfo | SequenceSummary) -> bool:
         """Return whether a sequence passes the filter; catalogs that cannot query use this method."""
         return (
             (self.match is None or fnmatchcase(info.name, self.match))

@@ -18,11 +18,12 @@ from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
 from io import BytesIO
 from operator import itemgetter
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote
 
+import msgspec
 import pyarrow as pa
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict
 
 from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
@@ -44,11 +45,13 @@ from mosaico_ingest.destinations.store.model import (
     check_not_merged,
 )
 from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.destinations.store.snapshot import DOCUMENT, SUMMARY, Content, read_rows, write_snapshot
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import PROVENANCE_KEY, IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, RemotePath
 
+T = TypeVar("T")
 FORMAT = 1
 """The version of the documents; it increases if earlier releases cannot read them."""
 
@@ -307,8 +310,12 @@ def _note(new: NewNote) -> NoteEntry:
 
 _SUFFIX = ".json"
 _THREADS = 16
+MAX_TAIL = 1000
+"""Number of documents above which a reader writes a snapshot first."""
 _LONGEST_NAME = 200
 """Object names do not contain longer sequence names in full."""
+_READS = 3
+"""Number of attempts to read a document that is replaced at the same time."""
 _TRIES, _PAUSE_S = 8, 0.25
 
 
@@ -415,15 +422,16 @@ class ObjectCatalog:
         return tuple(one.info(self._root) for one in self._all())
 
     def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
-        """See `StoreCatalog.listing`; filters of the content read every document whose name matches."""
+        """See `StoreCatalog.listing`; long pages and filters of the content use the snapshot of the catalog."""
         names = [
             name for name in self.names() if selection.match is None or fnmatchcase(name, selection.match)
         ]
         if selection.metadata or selection.incomplete:
-            names = [info.name for info in self._infos(names) if selection.selects(info)]
+            known = {one.name: one for one in self._summaries(names)}
+            names = [name for name in names if name in known and selection.selects(known[name])]
         rest = [name for name in names if after is None or name > after]
         page = rest[:limit]
-        summaries = tuple(map(SequenceSummary.of, self._infos(page)))
+        summaries = tuple(self._summaries(page))
         return Listing(summaries, len(names), page[-1] if page and len(page) < len(rest) else None)
 
     def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
@@ -571,8 +579,56 @@ class ObjectCatalog:
         return self._read(path).name if len(name) > _LONGEST_NAME else unquote(name)
 
     def _all(self) -> list[SequenceDocument]:
+        documents = self._current(DOCUMENT, SequenceDocument.model_validate_json, lambda document: document)
+        return sorted(documents, key=lambda one: one.name)
+
+    def _summaries(self, names: Sequence[str]) -> list[SequenceSummary]:
+        """Return the summaries of the sequences that still exist, in the order of the names."""
+        if len(names) <= MAX_TAIL:
+            return list(map(SequenceSummary.of, self._infos(names)))
+        summaries = {one.name: one for one in self._current(SUMMARY, _decode_summary, self._summary)}
+        return [summaries[name] for name in names if name in summaries]
+
+    def _summary(self, document: SequenceDocument) -> SequenceSummary:
+        return SequenceSummary.of(document.info(self._root))
+
+    def _current(
+        self, column: str, decode: Callable[[bytes], T], derive: Callable[[SequenceDocument], T]
+    ) -> list[T]:
+        """Return a value for each sequence, from the snapshot or, if it changed since, from its document."""
+        documents = self._listed()
+        rows = read_rows(self._root, column, documents)
+        if len(documents) - len(rows) > MAX_TAIL:
+            with suppress(SinkError):  # readers may not be allowed to write
+                write_snapshot(self._root, self._listed, self._contents)
+                rows = read_rows(self._root, column, documents)
+        tail = [path for key, path in documents.items() if key not in rows]
+        return [
+            *map(decode, rows.values()),
+            *(derive(one) for one in self._read_all(tail) if one is not None),
+        ]
+
+    def _contents(self, paths: Sequence[RemotePath]) -> list[Content | None]:
+        """Return the content of rows of the snapshot for documents; None for those that no longer exist."""
+        return [
+            None
+            if document is None
+            else Content(msgspec.json.encode(self._summary(document)), _encoded_document(document))
+            for document in self._read_all(paths)
+        ]
+
+    def _listed(self) -> dict[str, RemotePath]:
+        return {path.name: path for path in self._paths()}
+
+    def _read_all(self, paths: Sequence[RemotePath]) -> list[SequenceDocument | None]:
         with ThreadPoolExecutor(_THREADS, thread_name_prefix="catalog") as pool:
-            return sorted(pool.map(self._read, self._paths()), key=lambda one: one.name)
+            return list(pool.map(self._read_or_none, paths))
+
+    def _read_or_none(self, path: RemotePath) -> SequenceDocument | None:
+        try:
+            return self._read(path)
+        except NotInStore:
+            return None
 
     def _infos(self, names: Iterable[str]) -> list[SequenceInfo]:
         """Return the sequences of these names that still exist, in the order of the names."""
@@ -580,25 +636,37 @@ class ObjectCatalog:
             return [info for info in pool.map(self.sequence, names) if info is not None]
 
     def _load(self, sequence: str) -> SequenceDocument | None:
-        try:
-            return self._read(self._document(sequence))
-        except NotInStore:
-            return None
+        return self._read_or_none(self._document(sequence))
 
     def _read(self, path: RemotePath) -> SequenceDocument:
         with translate_errors(path):
             try:
-                return SequenceDocument.model_validate(json.loads(path.read_bytes()))
+                for _ in range(_READS - 1):
+                    # pyarrow asks for the size first, so a document that a writer replaces meanwhile may end early.
+                    with suppress(ValueError):
+                        return _parsed(path)
+                return _parsed(path)
             except FileNotFoundError as err:
                 raise NotInStore("it is not in the catalog", where=str(path)) from err
-            except (ValueError, ValidationError) as err:
+            except ValueError as err:
                 problem = str(err).splitlines()[0]
                 raise SinkError(f"the document cannot be read: {problem}", where=str(path)) from err
 
     def _put(self, document: SequenceDocument) -> None:
-        content = json.dumps(document.model_dump(mode="python"), default=str).encode()
         with translate_errors(self._root):
-            self._document(document.name).write_bytes(content)
+            self._document(document.name).write_bytes(_encoded_document(document))
+
+
+def _parsed(path: RemotePath) -> SequenceDocument:
+    return SequenceDocument.model_validate(json.loads(path.read_bytes()))
+
+
+def _encoded_document(document: SequenceDocument) -> bytes:
+    return json.dumps(document.model_dump(mode="python"), default=str).encode()
+
+
+def _decode_summary(content: bytes) -> SequenceSummary:
+    return msgspec.json.decode(content, type=SequenceSummary)
 
 
 def _number(marker: bytes) -> int:
