@@ -155,17 +155,13 @@ def suggest_names(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
 
 
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is closest to `word`: the same letters, a missing prefix, or a typo; None if none is close."""
-    words = list(known)
-    plain = {normalized_word(candidate): candidate for candidate in words}
-    if normalized_word(word) in plain:
-        return plain[normalized_word(word)]
-    tails = [
-        candidate for candidate in words if normalized_word(candidate).endswith(f"_{normalized_word(word)}")
-    ]
-    if len(tails) == 1:
-        return tails[0]
-    close = get_close_matches(normalized_word(word), plain, n=1, cutoff=0.6)
+    """Return the known word that is closest to `word`: the same letters, its start or end, or a typo; None if none is close."""
+    plain = {normalized_word(candidate): candidate for candidate in known}
+    own = normalized_word(word)
+    if own in plain:
+        return plain[own]
+    longer = [name for name in plain if name.endswith(f"_{own}") or name.startswith(f"{own}_")]
+    close = longer if len(longer) == 1 else get_close_matches(own, plain, n=1, cutoff=0.6)
     return plain[close[0]] if close else None
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.findings import nearest
 from mosaico_ingest.job.manifest import check_manifest, load_manifest
 from mosaico_ingest.job.values import Stores, TopicLevelErrorPolicy
 from mosaico_ingest.job.yaml_source import load_source
@@ -131,6 +132,22 @@ def test_check_manifest_several_mistakes_are_in_text_order() -> None:
         ("5:13", "wrong-value"),
         ("6:1", "unknown-key"),
     ]
+
+
+@pytest.mark.parametrize(
+    ("word", "known", "expected"),
+    [
+        ("time", ["image", "time_offset"], "time_offset"),
+        ("distro", ["desert", "ros_distro"], "ros_distro"),
+        ("on-error", ["on_error", "on_errors"], "on_error"),
+        ("metadta", ["metadata", "rename"], "metadata"),
+        ("x", ["time_offset", "image"], None),
+    ],
+)
+def test_nearest_prefers_the_start_or_end_of_one_key_to_typos(
+    word: str, known: list[str], expected: str | None
+) -> None:
+    assert nearest(word, known) == expected
 
 
 def test_check_manifest_misspelled_required_key_is_not_also_missing() -> None:
