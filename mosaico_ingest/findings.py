@@ -154,14 +154,21 @@ def suggest_names(names: Iterable[str], wanted: Iterable[str] = ()) -> str:
     return f"the nearest is {join_names(nearest)}; {listing}" if nearest else listing
 
 
+_ONE_LETTER, _SIMILAR = 0.8, 0.6
+"""Minimum ratios of `difflib` for words that differ in one letter, and for similar words."""
+
+
 def nearest(word: str, known: Iterable[str]) -> str | None:
-    """Return the known word that is closest to `word`: the same letters, its start or end, or a typo; None if none is close."""
+    """Return the known word that is closest to `word`; None if none is close.
+
+    A typo of one letter comes first, then a longer word that starts or ends with the word, then worse typos.
+    """
     plain = {normalized_word(candidate): candidate for candidate in known}
     own = normalized_word(word)
-    if own in plain:
-        return plain[own]
-    longer = [name for name in plain if name.endswith(f"_{own}") or name.startswith(f"{own}_")]
-    close = longer if len(longer) == 1 else get_close_matches(own, plain, n=1, cutoff=0.6)
+    close = get_close_matches(own, plain, n=1, cutoff=_ONE_LETTER)
+    if not close:
+        longer = [name for name in plain if name.endswith(f"_{own}") or name.startswith(f"{own}_")]
+        close = longer if len(longer) == 1 else get_close_matches(own, plain, n=1, cutoff=_SIMILAR)
     return plain[close[0]] if close else None
 
 

@@ -141,10 +141,12 @@ def test_check_manifest_several_mistakes_are_in_text_order() -> None:
         ("distro", ["desert", "ros_distro"], "ros_distro"),
         ("on-error", ["on_error", "on_errors"], "on_error"),
         ("metadta", ["metadata", "rename"], "metadata"),
+        ("topic", ["topic_settings", "topics"], "topics"),
+        ("tpi", ["topics"], "topics"),
         ("x", ["time_offset", "image"], None),
     ],
 )
-def test_nearest_prefers_the_start_or_end_of_one_key_to_typos(
+def test_nearest_prefers_typos_of_one_letter_then_longer_words(
     word: str, known: list[str], expected: str | None
 ) -> None:
     assert nearest(word, known) == expected
