@@ -91,9 +91,8 @@ class Evaluation:
         column = self._cache.get(typed)
         if column is None:
             column = self._compute(typed)
-            if (
-                not self._branch_conditions
-            ):  # Inside a branch, rows that do not take it may have invalid values.
+            # Inside a branch, rows that do not take it may have invalid values.
+            if not self._branch_conditions:
                 self._cache[typed] = column
         return column
 
