@@ -7,6 +7,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import closing
 from typing import TYPE_CHECKING, Any
 
+from typing_extensions import Self
+
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import NothingMatched
@@ -23,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class MosaicoToROSLoader:
-    """The messages of a sequence in their original types, ordered by log time. Iterate it once or several times.
+    """The topics and messages of a sequence in their original types, by log time. Iterate it once or several times.
 
     Messages are restored as `export_sequence` restores them: see docs/export.md for the fields that can differ.
     """
@@ -57,9 +59,9 @@ class MosaicoToROSLoader:
         )
         patterns = [topics] if isinstance(topics, str) else list(topics or ())
         candidates = restorers_of(self._source, patterns, Definitions(store, finder))
-        self._restorers = {one.info.name: one for one in candidates if isinstance(one, Restorer)}
+        self._restorers = {topic.info.name: topic for topic in candidates if isinstance(topic, Restorer)}
         self.rejected_topics: dict[str, str] = {
-            one.topic: one.excluded for one in candidates if not isinstance(one, Restorer)
+            topic.topic: topic.excluded for topic in candidates if not isinstance(topic, Restorer)
         }
         """The reason for each selected topic whose messages cannot be restored."""
         self._window = (start_timestamp_ns, end_timestamp_ns)
@@ -77,7 +79,7 @@ class MosaicoToROSLoader:
     @property
     def msg_types(self) -> list[str]:
         """The message types of the topics, sorted."""
-        return sorted({one.definition.root for one in self._restorers.values()})
+        return sorted({restorer.definition.root for restorer in self._restorers.values()})
 
     @property
     def duration(self) -> int:
@@ -103,20 +105,29 @@ class MosaicoToROSLoader:
         batches = (self._source.rows(self._restorers[name].info, *self._window) for name in names)
         return sum(batch.num_rows for rows in batches for batch in rows)
 
-    def __iter__(self) -> Iterator[ROSMessage]:
-        """Yield the messages by log time.
+    def __iter__(self) -> Iterator[tuple[str, ROSMessage]]:
+        """Yield each message with its topic, by log time.
 
         Raises:
             SinkError: The sequence cannot be read.
             AdapterError: An adapter in Python fails.
         """
-        messages = [self._messages(one) for one in self._restorers.values()]
-        yield from heapq.merge(*messages, key=lambda message: message.bag_timestamp_ns)
+        messages = [self._messages(restorer) for restorer in self._restorers.values()]
+        for message in heapq.merge(*messages, key=lambda message: message.bag_timestamp_ns):
+            yield message.topic, message
 
     def _messages(self, restorer: Restorer) -> Iterator[ROSMessage]:
         with closing(self._source.rows(restorer.info, *self._window)) as batches:
             for log_ns, values in restorer.read_values(batches):
                 yield ROSMessage(log_ns, restorer.info.name, restorer.definition.root, values)
+
+    def __enter__(self) -> Self:
+        """Return the loader."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """Close the loader."""
+        self.close()
 
     def close(self) -> None:
         """Do nothing: the client or the store belongs to the caller."""

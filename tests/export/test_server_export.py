@@ -357,11 +357,13 @@ def test_loader_of_a_server_yields_the_messages_of_the_recording(server: Server)
     topics = ["/imu", "/tf", "/battery", "/lidar/points"]
     ingest(server.port, DRIVE, topics=[*topics, "/odom"])
     with connect(ServerTarget("127.0.0.1", server.port)) as client:
-        loader = MosaicoToROSLoader(client, None, "s", topics)
-        restored = list(loader)
+        with MosaicoToROSLoader(client, None, "s", topics) as loader:
+            pairs = list(loader)
         counts = loader.msg_count(), loader.msg_count("/imu")
         with pytest.raises(NothingMatched, match="/odom"):
             loader.msg_count("/odom")
+    restored = [message for _, message in pairs]
+    assert [topic for topic, _ in pairs] == [message.topic for message in restored]
     with ROSLoader(DRIVE, topics=topics) as recording:
         assert by_topic(restored) == by_topic(message for message, _ in recording)
         assert (loader.topics, loader.duration > 0) == (recording.topics, True)
@@ -382,6 +384,6 @@ def test_loader_of_a_store_applies_the_time_range_and_names_rejected_topics(
     start = store.sequence("s").start_ns or 0
     typestore = get_typestore(RosbagsStores.ROS2_HUMBLE)
     loader = MosaicoToROSLoader(store, typestore, "s", None, start, start + 10**9)
-    assert {message.msg_type for message in loader} == {"sensor_msgs/msg/Imu"}
+    assert {message.msg_type for _, message in loader} == {"sensor_msgs/msg/Imu"}
     assert loader.msg_count() == len(list(loader)) == 100
     assert list(loader.rejected_topics) == ["/battery"]

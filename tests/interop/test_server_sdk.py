@@ -13,11 +13,13 @@ from typing import Any
 
 import pytest
 from message_differences import differences as message_differences
+from rosbags.typesys import Stores as RosbagsStores
 
 from mosaico_ingest.api import RosbagInjector
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.export import export_sequence
+from mosaico_ingest.export.loader import MosaicoToROSLoader
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget
@@ -292,3 +294,19 @@ def test_export_of_sequence_uploaded_by_the_sdk_equals_the_recording(served: Ser
     # The SDK stores the codec only, and not the text of the message.
     listed = {"/camera/image_raw/compressed": {"format"}}
     assert message_differences(RECORDING, tmp_path / "out.mcap") == listed
+
+
+def test_both_sequence_loaders_yield_the_same_topics_and_times(served: Server, client: Any) -> None:
+    bridge = pytest.importorskip(
+        "mosaicolabs.bridges.ros", reason="the SDK has no loader of sequences before 0.7"
+    )
+
+    def pairs(loader: Any) -> list[tuple[str, int]]:
+        with loader:
+            return [(topic, message.timestamp_ns) for topic, message in loader]
+
+    topics = ["/imu", "/odom"]
+    with connect(ServerTarget("127.0.0.1", served.port)) as own_client:
+        ours = pairs(MosaicoToROSLoader(own_client, RosbagsStores.ROS2_HUMBLE, "ours", topics))
+    assert ours == pairs(bridge.MosaicoToROSLoader(client, RosbagsStores.ROS2_HUMBLE, "ours", topics))
+    assert {topic for topic, _ in ours} == set(topics)
