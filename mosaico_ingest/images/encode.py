@@ -11,11 +11,10 @@ import numpy.typing as npt
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.encodings import RawImage, Samples, eight_bits, raw_samples
+from mosaico_ingest.images.encodings import RawImage, Samples, eight_bits, has_colors, raw_samples
 from mosaico_ingest.images.files import file_samples, jpeg_file, png_file, resized
 from mosaico_ingest.job.image import ImageSettings
 
-_COLOR_AXES = 3
 _RGB = 3
 _MAX_DEPTH = 0xFFFF
 _PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
@@ -99,15 +98,15 @@ def _jpeg_samples(samples: Samples, encoding: str) -> npt.NDArray[np.uint8]:
     if samples.values.dtype.kind != "u":
         raise ViewError(f"{encoding} is not an encoding of pictures; raw and buffer_png keep it")
     pixels = eight_bits(samples.values)
-    return np.ascontiguousarray(pixels[..., :_RGB]) if _has_colors(pixels) else pixels
+    return np.ascontiguousarray(pixels[..., :_RGB]) if has_colors(pixels) else pixels
 
 
 def _png_samples(samples: Samples, encoding: str, depth_unit: float) -> npt.NDArray[Any]:
     values = samples.values
-    if samples.is_measured and values.ndim < _COLOR_AXES and values.dtype.kind == "f":
+    if samples.is_measured and not has_colors(values) and values.dtype.kind == "f":
         return _quantized(values, depth_unit)
-    fits = values.dtype == np.uint8 or (values.dtype == np.uint16 and not _has_colors(values))
-    if not fits or (samples.is_measured and _has_colors(values)):
+    fits = values.dtype == np.uint8 or (values.dtype == np.uint16 and not has_colors(values))
+    if not fits or (samples.is_measured and has_colors(values)):
         raise ViewError(f"png cannot store samples of {encoding}; raw and buffer_png keep them")
     return values
 
@@ -143,10 +142,6 @@ def _picked(old: int, new: int) -> npt.NDArray[np.int64]:
 
 def _encoding_of(values: npt.NDArray[Any], *, is_measured: bool) -> str:
     bits = values.dtype.itemsize * 8
-    if _has_colors(values):
+    if has_colors(values):
         return f"{'rgb' if values.shape[2] == _RGB else 'rgba'}{bits}"
     return f"{bits}UC1" if is_measured else f"mono{bits}"
-
-
-def _has_colors(values: npt.NDArray[Any]) -> bool:
-    return values.ndim == _COLOR_AXES

@@ -86,9 +86,9 @@ def raw_pixels(image: RawImage) -> Pixels:
     samples = raw_samples(image)
     values = samples.values
     if samples.is_measured:
-        return color_map(np.hypot(values[..., 0], values[..., 1]) if values.ndim == _COLOR_AXES else values)
+        return color_map(np.hypot(values[..., 0], values[..., 1]) if has_colors(values) else values)
     pixels = eight_bits(values)
-    return gray(pixels) if pixels.ndim < _COLOR_AXES else np.ascontiguousarray(pixels[..., :3])
+    return np.ascontiguousarray(pixels[..., :3]) if has_colors(pixels) else gray(pixels)
 
 
 def eight_bits(values: _Array) -> Pixels:
@@ -100,6 +100,11 @@ def is_bayer(encoding: str) -> str | None:
     """Return the pattern of a Bayer encoding, such as `rggb`, or None."""
     match = _BAYER.fullmatch(encoding)
     return match[1] if match else None
+
+
+def has_colors(values: npt.NDArray[Any]) -> bool:
+    """Return whether the last of three axes has the channels of colors."""
+    return values.ndim == _COLOR_AXES
 
 
 def gray(values: Pixels) -> Pixels:
@@ -139,15 +144,15 @@ def _samples(image: RawImage, kind: str, channels: int) -> _Array:
     return samples.astype(item.newbyteorder("="), copy=False)
 
 
-def _rows(image: RawImage, used: int, height: int) -> npt.NDArray[np.uint8]:
+def _rows(image: RawImage, row_bytes: int, height: int) -> npt.NDArray[np.uint8]:
     """Return the first `used` bytes of each row, of shape (height, used)."""
-    stride = image.stride if image.stride and height > 1 else used
-    if image.stride and image.stride < used:
+    stride = image.stride if image.stride and height > 1 else row_bytes
+    if image.stride and image.stride < row_bytes:
         raise ViewError(
-            f"a row of {image.width} pixels in {image.encoding} has {used} bytes, but the stride is {image.stride}"
+            f"a row of {image.width} pixels in {image.encoding} has {row_bytes} bytes, but the stride is {image.stride}"
         )
     data = np.frombuffer(image.data, np.uint8)
-    needed = stride * (height - 1) + used
+    needed = stride * (height - 1) + row_bytes
     if data.size < needed:
         size = f"{image.width} x {image.height}"
         raise ViewError(
@@ -155,7 +160,7 @@ def _rows(image: RawImage, used: int, height: int) -> npt.NDArray[np.uint8]:
         )
     if data.size < stride * height:  # the last row need not be padded
         data = np.pad(data, (0, stride * height - data.size))
-    return data[: stride * height].reshape(height, stride)[:, :used]
+    return data[: stride * height].reshape(height, stride)[:, :row_bytes]
 
 
 def _eight_bits(samples: _Array) -> Pixels:
