@@ -158,17 +158,17 @@ def decompress_partially(
     if is_plain(compression):
         return np.frombuffer(data[:size], np.uint8)
     target = allocate(size)
-    written = 0
+    size_so_far = 0
     try:
         for window in _windows(data, compression):
-            count = min(len(window), size - written)
-            target[written : written + count] = np.frombuffer(window, np.uint8, count)
-            written += count
-            if written == size:
+            count = min(len(window), size - size_so_far)
+            target[size_so_far : size_so_far + count] = np.frombuffer(window, np.uint8, count)
+            size_so_far += count
+            if size_so_far == size:
                 break
     except _ERRORS:
         pass  # the bytes before the damage are the result
-    return target[:written]
+    return target[:size_so_far]
 
 
 def decompress_message(data: bytes, limit: int) -> bytes:
@@ -265,8 +265,8 @@ def _decompress(data: bytes | memoryview, compression: str, size: int) -> tuple[
         if declared not in (size, zstandard.CONTENTSIZE_UNKNOWN):
             raise BagError(f"{size} bytes announced, the zstd frame announces {declared}")
         target = allocate(size)
-        written, excess = _zstd_into(target, data)
-        return target[:written], excess
+        length, excess = _zstd_into(target, data)
+        return target[:length], excess
     decompressor = _decompressor(compression)
     plain = decompressor.decompress(data, max(size, 1))
     if len(plain) > size:
@@ -293,11 +293,11 @@ def _decompress_into(target: Bytes, chunk: CompressedChunk, data: Bytes, limit: 
         target[:] = _decompress_chunk(chunk, data, limit)
         return
     try:
-        written, excess = _zstd_into(target, data[chunk.start : chunk.end].data)
+        length, excess = _zstd_into(target, data[chunk.start : chunk.end].data)
     except _ERRORS as err:
         raise BagError(f"damaged zstd data: {err}") from err
-    if written != len(target) or excess:
-        raise BagError(f"{len(target)} bytes announced, {'more' if excess else written} found")
+    if length != len(target) or excess:
+        raise BagError(f"{len(target)} bytes announced, {'more' if excess else length} found")
 
 
 def _zstd_into(target: Bytes, data: bytes | memoryview) -> tuple[int, bool]:
@@ -326,5 +326,5 @@ def _windows(data: bytes | memoryview, compression: str) -> Iterator[bytes]:
 
 def _decompressor(compression: str) -> _Decompressor:
     if compression not in _DECOMPRESSORS:
-        raise BagError(f"compression {compression!r} is unknown; known are {', '.join(_KNOWN)}")
+        raise BagError(f"compression {compression!r} is unknown; the supported ones are {', '.join(_KNOWN)}")
     return _DECOMPRESSORS[compression]()

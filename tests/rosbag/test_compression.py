@@ -68,7 +68,9 @@ def test_decompress_more_than_announced_raises() -> None:
 
 
 def test_decompress_unknown_compression_raises() -> None:
-    with pytest.raises(BagError, match="compression 'snappy' is unknown; known are none, zstd, lz4, bz2"):
+    with pytest.raises(
+        BagError, match="compression 'snappy' is unknown; the supported ones are none, zstd, lz4, bz2"
+    ):
         decompress(b"x", "snappy", 1)
 
 

@@ -116,9 +116,9 @@ def store_of(store: Stores | str | None) -> Stores | None:
         # members of the enumeration of rosbags are accepted too
         return Stores(store.value if isinstance(store, Enum) else store)
     except ValueError:
-        known = [known.value for known in Stores]
-        near = get_close_matches(str(store), known, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"known are {', '.join(known)}"
+        names = [distro.value for distro in Stores]
+        near = get_close_matches(str(store), names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"the distros are {', '.join(names)}"
         raise BagError(f"unknown distro {store!r}", hint=hint) from None
 
 
@@ -158,7 +158,7 @@ def _syntax_error(error: BagError, file: Path, text: str) -> BagError:
     return DefinitionError(error.what, where=str(span), hint=error.hint, findings=(finding,))
 
 
-def _check_local_types(own: Sequence[Registered], known: Container[str]) -> None:
+def _check_local_types(own: Sequence[Registered], public_names: Container[str]) -> None:
     """Check that every field type without a package, which can only be in the same package, is defined.
 
     Raises:
@@ -173,14 +173,14 @@ def _check_local_types(own: Sequence[Registered], known: Container[str]) -> None
             if field.is_message and "/" not in field.type and field.type != "Header"
         )
         for name, msgtype in names:
-            if entry.file is not None and f"{package}/msg/{msgtype}" not in known:
+            if entry.file is not None and f"{package}/msg/{msgtype}" not in public_names:
                 raise _unknown_type(entry, entry.file, name, msgtype)
 
 
 def _unknown_type(entry: Registered, file: Path, name: str, msgtype: str) -> DefinitionError:
     declaration = re.compile(rf"\s*(?P<type>{re.escape(msgtype)})\b.*\s{re.escape(name)}\b")
     matches = enumerate(map(declaration.match, entry.text.splitlines()), 1)
-    line, column = next(((line, found.start("type") + 1) for line, found in matches if found), (1, 1))
+    line, column = next(((line, match.start("type") + 1) for line, match in matches if match), (1, 1))
     span = Span(str(file), line, column, line, column + len(msgtype))
     message, hint = f"the type {msgtype!r} is not defined", suggest_type(msgtype)
     finding = Finding("msg-unknown-type", Severity.ERROR, message, span, hint)
@@ -317,7 +317,7 @@ class TypeResolver:
         ]
         assumed = {name: who for name, who in self._assumed.items() if name in types}
         for who in dict.fromkeys(assumed.values()):
-            names = ", ".join(name for name, known in assumed.items() if known == who)
+            names = ", ".join(name for name, origin in assumed.items() if origin == who)
             message = f"the recording does not define these types; the definitions of {who} are used: {names}"
             remedy = (
                 _OVERRIDE_HINT if who.startswith(_PACKAGE) else "set ros_distro to select the definitions"
@@ -371,8 +371,8 @@ class TypeResolver:
         if embedded and embedded.encoding not in _UNSPECIFIED and _is_empty(embedded.text):
             # An empty text is a type without fields, unless a distro has the type: recorders without the definition
             # write an empty text, or a comment.
-            known = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
-            empty = {} if known else {root: MessageType(root, ())}
+            is_public = any(distro_type(distro, root) for distro in (ROS1 if version == 1 else ROS2))
+            empty = {} if is_public else {root: MessageType(root, ())}
             sources.append(_TypeSource("the recording's empty text", Source.BAG, empty.get))
         return sources
 
@@ -434,6 +434,6 @@ def _is_empty(text: str) -> bool:
 
 def _by_name(entries: Iterable[Registered]) -> dict[str, MessageType]:
     """Return all types by name; a definition of its own takes precedence over one nested in another text."""
-    chosen = list(entries)
-    types = {name: message for entry in reversed(chosen) for name, message in entry.types.items()}
-    return types | {entry.msgtype: entry.types[entry.msgtype] for entry in chosen}
+    selection = list(entries)
+    types = {name: message for entry in reversed(selection) for name, message in entry.types.items()}
+    return types | {entry.msgtype: entry.types[entry.msgtype] for entry in selection}
