@@ -377,9 +377,8 @@ class RemotePath:
         """Return a function that returns a range of the open file; several threads can call it at the same time."""
         if self._handler is None or not self.has_ranges:
             return partial(_read_at, file)
-        return partial(
-            self._handler.read_range, self.filesystem_path
-        )  # a file in Python reads one range at a time
+        # An open file of a file system in Python reads one range at a time.
+        return partial(self._handler.read_range, self.filesystem_path)
 
     @property
     def _handler(self) -> Any:  # noqa: ANN401 - `WebFiles` and `AzureFiles` are imported lazily
@@ -439,15 +438,15 @@ def without_options(text: str) -> str:
     return text.partition("?")[0] if is_url(text) else text
 
 
-def as_path(given: str | Path | RemotePath) -> AnyPath:
+def as_path(location: str | Path | RemotePath) -> AnyPath:
     """Return the local or remote path of a text; `file://` URLs are local paths.
 
     Raises:
         IngestError: The URL has an unknown scheme, no bucket, or a password.
     """
-    if isinstance(given, RemotePath) or not is_url(str(given)):
-        return Path(given) if isinstance(given, str) else given
-    text = str(given)
+    if isinstance(location, RemotePath) or not is_url(str(location)):
+        return Path(location) if isinstance(location, str) else location
+    text = str(location)
     if "://" not in text:  # `Path` has merged the slashes
         text = text.replace(":/", ":///" if text.startswith("file:") else "://", 1)
     try:

@@ -98,9 +98,9 @@ class WebFiles(FileSystemHandler):
 
     def properties(self, path: str, *, cached: bool = True) -> Properties | None:
         """Return the properties of a file, None if it does not exist."""
-        at_s, known = self._properties.get(path, (-_FRESH_S, None))
+        at_s, file_properties = self._properties.get(path, (-_FRESH_S, None))
         if cached and time.monotonic() - at_s < _FRESH_S:
-            return known
+            return file_properties
         try:
             response, where = self.request(path, 0, 1)
         except FileNotFoundError:

@@ -86,7 +86,7 @@ class _Candidate(Struct, frozen=True):
     type: DataType
     msgtype: str | None
     """The message type of a message, or of a list of messages."""
-    listed: bool
+    is_repeated: bool
 
     @property
     def text(self) -> str:
@@ -125,11 +125,11 @@ def _column(field: DataType, candidates: Sequence[_Candidate]) -> ColumnDraft:
 
 def _by_likeness(field: DataType, candidates: Sequence[_Candidate]) -> Iterator[list[_Candidate]]:
     """Yield groups of candidate fields, best match first. A group with several fitting fields is ambiguous."""
-    named = [
+    namesakes = [
         candidate for candidate in candidates if _normalized(candidate.path[-1]) == _normalized(field.name)
     ]
-    yield [candidate for candidate in named if len(candidate.path) == 1]
-    yield named
+    yield [candidate for candidate in namesakes if len(candidate.path) == 1]
+    yield namesakes
     if pt.is_struct(field.type):
         yield [
             candidate
@@ -165,15 +165,19 @@ def _fitting(candidate: _Candidate, target: DataType) -> str | None:
         return candidate.text
     if is_number(candidate.type) and is_number(target):
         return f"cast({candidate.text})"
-    nested = _adapted(candidate.msgtype, listed=candidate.listed)
+    nested = _adapted(candidate.msgtype, is_repeated=candidate.is_repeated)
     if nested is None:
         return None
     adapter, columns = nested
-    return _by_adapter(adapter, candidate.text, listed=candidate.listed) if _fits(columns, target) else None
+    return (
+        _by_adapter(adapter, candidate.text, is_repeated=candidate.is_repeated)
+        if _fits(columns, target)
+        else None
+    )
 
 
-def _by_adapter(adapter: str, text: str, *, listed: bool) -> str:
-    return f'{{use: {adapter}, of: "{text}{"[]" if listed else ""}"}}'
+def _by_adapter(adapter: str, text: str, *, is_repeated: bool) -> str:
+    return f'{{use: {adapter}, of: "{text}{"[]" if is_repeated else ""}"}}'
 
 
 def _expression(first: str, *rest: str) -> str:
@@ -191,13 +195,13 @@ def _fits(source: DataType, target: DataType, msgtype: str | None = None) -> boo
     return True
 
 
-def _adapted(msgtype: str | None, *, listed: bool) -> tuple[str, DataType] | None:
+def _adapted(msgtype: str | None, *, is_repeated: bool) -> tuple[str, DataType] | None:
     """Return the built-in adapter of a nested message and the type of its records."""
     builtin = BY_TYPE.get(msgtype or "")
     if builtin is None:
         return None
     struct = ontology_type(builtin.tag).struct
-    return builtin.name, pa.list_(struct) if listed else struct
+    return builtin.name, pa.list_(struct) if is_repeated else struct
 
 
 def _placeholder(type_: DataType) -> str:
@@ -249,27 +253,29 @@ def _mirrored_field(
     definition: Definition, field: Field, name: str, type_: DataType, margin: str
 ) -> _Columns:
     """Return the columns for one field of the message."""
-    listed, text = field.container is not Container.SCALAR, _expression(field.name)
+    is_repeated, text = field.container is not Container.SCALAR, _expression(field.name)
     if not field.is_message:
         return [f"{margin}{quote_key(name)}: {format_type(type_)}"], [
             ColumnDraft(name, quote_expression(text))
         ]
-    nested = _adapted(field.type, listed=listed)
+    nested = _adapted(field.type, is_repeated=is_repeated)
     if nested is not None:
         tag = BY_TYPE[field.type].tag
         own = (
             quote_expression(text)
-            if tag == "Header" and not listed
-            else _by_adapter(nested[0], text, listed=listed)
+            if tag == "Header" and not is_repeated
+            else _by_adapter(nested[0], text, is_repeated=is_repeated)
         )
-        return [f"{margin}{quote_key(name)}: {f'list[{tag}]' if listed else tag}"], [ColumnDraft(name, own)]
+        return [f"{margin}{quote_key(name)}: {f'list[{tag}]' if is_repeated else tag}"], [
+            ColumnDraft(name, own)
+        ]
     inner = _mirrored_fields(definition, field.type, _element(type_), margin + "    ")
     lines = [line for part, _ in inner for line in part]
     drafts = tuple(column_draft for _, part in inner for column_draft in part)
     if not lines:
         return [], []
-    head = [f"{margin}{quote_key(name)}:", *([f"{margin}  type: list"] if listed else [])]
-    of = quote_expression(f"{text}[]" if listed else text)
+    head = [f"{margin}{quote_key(name)}:", *([f"{margin}  type: list"] if is_repeated else [])]
+    of = quote_expression(f"{text}[]" if is_repeated else text)
     return [*head, f"{margin}  fields:", *lines], [ColumnDraft(name, of, fields=drafts)]
 
 
@@ -384,10 +390,10 @@ def _test(
         yield "    expect: {}"
         return
     adapted = adapter.adapt(example.row, Envelope("", definition.root, np.zeros(1, np.int64)))
-    given = flow_style(_without_defaults(cast("Any", example.row)[0].as_py()))
+    message = flow_style(_without_defaults(cast("Any", example.row)[0].as_py()))
     yield f"  - name: a message of {example.location['topic']}"
-    is_short = len(given) <= _LONG and definition.language is Language.ROS
-    yield f"    given: {given if is_short else flow_style(example.location)}"
+    is_short = len(message) <= _LONG and definition.language is Language.ROS
+    yield f"    given: {message if is_short else flow_style(example.location)}"
     if adapted.failures:
         yield f"    # {spec.name} rejects it: {adapted.failures[0].reason}"
         yield f"    rejects: {flow_style(adapted.failures[0].reason)}"

@@ -27,8 +27,8 @@ def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
     """
     if not isinstance(adapter, MappingAdapter):
         return ()
-    read = {*column_reads(adapter), *metadata_reads(adapter)}
-    return tuple(".".join(path) for path in unread_paths(shape, read))
+    reads = {*column_reads(adapter), *metadata_reads(adapter)}
+    return tuple(".".join(path) for path in unread_paths(shape, reads))
 
 
 class ColumnOrigin(Struct, frozen=True):
@@ -124,8 +124,8 @@ def _columns(struct: DataType, values: Mapping[str, Value], prefix: str) -> Iter
         if value.fields is not None:
             yield from _columns(element, {**value.fields, **(value.replaced or {})}, inner)
         elif value.replaced:
-            named = [child for child in element if child.name in value.replaced]
-            yield from _columns(named, value.replaced, inner)
+            replacements = [child for child in element if child.name in value.replaced]
+            yield from _columns(replacements, value.replaced, inner)
 
 
 def _origin(form: ValueForm) -> str:

@@ -296,10 +296,10 @@ class PythonAdapter(Struct, frozen=True):
         yield first, self._checked(result, len(rows))
 
     def _checked(self, result: object, count: int) -> pa.StructArray:
-        wanted = self.ontology.struct
+        row_type = self.ontology.struct
         if isinstance(result, pa.RecordBatch):
             result = result.to_struct_array()
-        if not isinstance(result, pa.StructArray) or result.type != wanted or len(result) != count:
+        if not isinstance(result, pa.StructArray) or result.type != row_type or len(result) != count:
             description = (
                 f"{len(result)} rows of {result.type}"
                 if isinstance(result, pa.Array)
@@ -307,7 +307,7 @@ class PythonAdapter(Struct, frozen=True):
             )
             raise AdapterError(
                 f"{self.adapter.__name__}.from_batch returned {description}, expected {count} rows of {self.ontology.tag}",
-                hint=f"return a StructArray of type {wanted}",
+                hint=f"return a StructArray of type {row_type}",
             )
         return result
 
@@ -325,12 +325,12 @@ class PythonAdapter(Struct, frozen=True):
         arrays = [self._columns_of(part, rows, envelope) for part in parts]
         index = np.array([row for part in parts for row in part.index], np.int64)
         times = np.array([time for part in parts for time in part.times], np.int64)
-        changed = not np.array_equal(times, envelope.log_times[index])
+        has_new_times = not np.array_equal(times, envelope.log_times[index])
         return Adapted(
             _joined(arrays, self.ontology.struct),
             index,
             tuple(failure for part in parts for failure in part.failures),
-            log_times=times if changed else None,
+            log_times=times if has_new_times else None,
         )
 
     def _from_dict(
@@ -351,9 +351,9 @@ class PythonAdapter(Struct, frozen=True):
         return int(translated.timestamp_ns), self._row_of(translated.data)
 
     def _row_of(self, value: object) -> dict[str, Any]:
-        wanted = self.adapter.__mosaico_ontology_type__
-        if not isinstance(value, wanted):
-            raise TypeError(f"returned {type(value).__name__}, expected {wanted.__name__}")
+        row_class = self.adapter.__mosaico_ontology_type__
+        if not isinstance(value, row_class):
+            raise TypeError(f"returned {type(value).__name__}, expected {row_class.__name__}")
         own: Any = value
         return own.to_row() if hasattr(own, "to_row") else own.model_dump()  # the SDK's models have no to_row
 

@@ -255,18 +255,18 @@ def _out_of_order(clause: Clause, topic: TopicFacts, facts: Facts) -> Expectatio
 def _header(clause: Clause, topic: TopicFacts, facts: Facts) -> ExpectationResult:
     monitor = topic.monitor
     if clause.key == "sequence_numbers" and facts.order is not None:
-        found = [facts.order.missing_numbers(key) for key in facts.connections.get(topic.name, ())]
-        gaps = [gap for gap in found if gap is not None]
+        keys = facts.connections.get(topic.name, ())
+        gaps = [gap for key in keys if (gap := facts.order.missing_numbers(key)) is not None]
         if gaps:
             missing = sum(gap.total for gap in gaps)
             worst = max((gap.worst for gap in gaps if gap.worst), key=lambda step: step.size, default=None)
             first = next((gap.first for gap in gaps if gap.first), None)
-            read = 0 if monitor is None else monitor.read
+            message_count = 0 if monitor is None else monitor.read
             return limit_result(
                 clause,
                 clause.expected.missing,
                 missing,
-                missing + read,
+                missing + message_count,
                 "sequence numbers are missing",
                 first=None if first is None else occurrence(first.log_time_ns, None, first.size),
                 worst=None if worst is None else occurrence(worst.log_time_ns, None, worst.size),

@@ -167,7 +167,7 @@ def referenced_topics(contract: Contract) -> frozenset[str]:
 
 def file_order(contract: Contract, topics: Iterable[str], *, is_mcap: bool) -> FileOrder | None:
     """Return the observer of the order in the files, or None if no topic needs it."""
-    wanted = {key for topic in topics for key in contract.topic_clauses(topic)} & ORDER_KEYS
-    if "out_of_order" in wanted or (is_mcap and wanted):
+    keys = {key for topic in topics for key in contract.topic_clauses(topic)} & ORDER_KEYS
+    if "out_of_order" in keys or (is_mcap and keys):
         return FileOrder(has_numbers=is_mcap)
     return None

@@ -107,8 +107,8 @@ class RecordingMonitor:
         )
 
     def _add(self, topic: ReadTopic, references: frozenset[str]) -> None:
-        known = self._of_topic.get(topic.topic, ())
-        self._of_topic[topic.topic] = (*known, *topic.connections)
+        known_connections = self._of_topic.get(topic.topic, ())
+        self._of_topic[topic.topic] = (*known_connections, *topic.connections)
         if self._add_outputs(topic, references):
             references |= {topic.topic}
         monitor = self._monitors.get(topic.topic) or topic_monitor(self._contract, topic.topic, references)
@@ -131,8 +131,8 @@ class RecordingMonitor:
         for name, _ in topic.outputs:
             is_known = name in self._outputs
             if not is_known:
-                listed = {name} if self._contract.lists(name) else set[str]()
-                self._outputs[name] = topic_monitor(self._contract, name, references | listed)
+                own_name = {name} if self._contract.lists(name) else set[str]()
+                self._outputs[name] = topic_monitor(self._contract, name, references | own_name)
             self._output_types[name] = self._output_types.get(name, {}) | msgtypes
             monitor = self._outputs[name]
             if monitor is not None:

@@ -122,8 +122,8 @@ class RowMonitor:
     def add_stored(self, rows: Array, batch: Batch) -> None:
         """Add rows of a stored topic, whose header is that of the ontology or of the ROS shape."""
         if self.latency is not None or self.steps:
-            stored = ontology_stamps_of(rows)
-            self._add_stamps(stamps_of(rows) if stored is None else stored, batch)
+            ontology_stamps = ontology_stamps_of(rows)
+            self._add_stamps(stamps_of(rows) if ontology_stamps is None else ontology_stamps, batch)
         if self.frames is not None and (frames := frames_of(rows)) is not None:
             self.frames.add(batch, frames)
         self._add_values(rows, batch, is_ontology=True)
@@ -183,8 +183,8 @@ def row_monitor(
         checks += [
             FieldCheck(clause, expression, _ACCUMULATORS[clause.key](clause.expected)) for clause in of_field
         ]
-    wanted = clauses.keys() & ROW_KEYS
-    if findings or not (checks or wanted):
+    row_keys = clauses.keys() & ROW_KEYS
+    if findings or not (checks or row_keys):
         return None, findings
     shape = ontology if stored else message
     names = () if shape is None else tuple(member.name for member in shape.struct)

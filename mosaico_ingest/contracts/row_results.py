@@ -86,9 +86,9 @@ def _description(accumulators: Sequence[Any]) -> tuple[str, Any, str]:
         return "finite numbers", None, "all values are finite"
     if isinstance(first, AllowedValues):
         return " or ".join(texts.value(value) for value in first.allowed), None, "all values are allowed"
-    known: list[NumberLimits | Changes] = list(accumulators)
-    lows = [one.lowest for one in known if one.lowest is not None]
-    highs = [one.highest for one in known if one.highest is not None]
+    ranges: list[NumberLimits | Changes] = list(accumulators)
+    lows = [one.lowest for one in ranges if one.lowest is not None]
+    highs = [one.highest for one in ranges if one.highest is not None]
     low = None if first.low == -inf else texts.number(first.low)
     high = None if first.high == inf else texts.number(first.high)
     limit = texts.bounds(low, high)
@@ -183,8 +183,8 @@ def _frames(clause: Clause, monitors: Sequence[RowMonitor]) -> ExpectationResult
     limit = " or ".join(map(repr, clause.expected.one_of))
     if not violations.count:
         return clause.passed(f"the frame of all messages is {limit}", limit=limit)
-    seen = ", ".join(repr(text) for frame in frames for text in frame.seen)
-    text = f"the frame of {count_text(violations.count)} of {counted(count, 'message')} is {seen}; expected {limit}"
+    frame_ids = ", ".join(repr(text) for frame in frames for text in frame.seen)
+    text = f"the frame of {count_text(violations.count)} of {counted(count, 'message')} is {frame_ids}; expected {limit}"
     measured = next((text for frame in frames for text in frame.seen), None)
     return _from_violations(clause, violations, text, limit=limit, measured=measured, unit="")
 

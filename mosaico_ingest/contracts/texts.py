@@ -53,8 +53,8 @@ def instant(ns: int) -> str:
 
 def part(limit: Limit, count: int, total: int, what: str) -> str:
     """Return the part of a total that a limit applies to, such as `3 of 20 messages were rejected (15%)`."""
-    shown = f" ({share(count / total)})" if limit.count is None and total else ""
-    return f"{count_text(count)} of {count_text(total)} {what}{shown}"
+    percentage = f" ({share(count / total)})" if limit.count is None and total else ""
+    return f"{count_text(count)} of {count_text(total)} {what}{percentage}"
 
 
 def limit(limit: Limit) -> str:

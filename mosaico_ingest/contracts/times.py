@@ -145,8 +145,8 @@ class SlidingWindow:
         )
         self._note(most, most > self.max_count, highest=True)
         if inside:
-            left = np.searchsorted(times, begins[:inside], "right")
-            least = np.searchsorted(times, begins[:inside] + self.length_ns, "right") - left
+            first_after = np.searchsorted(times, begins[:inside], "right")
+            least = np.searchsorted(times, begins[:inside] + self.length_ns, "right") - first_after
             self._note(least, least < self.min_count, highest=False)
         self._times = times[starts:]
         self._index += starts
@@ -154,8 +154,8 @@ class SlidingWindow:
     def _note(self, counts: NDArray[np.intp], is_bad: NDArray[np.bool_], *, highest: bool) -> None:
         position = int(counts.argmax() if highest else counts.argmin())
         extreme = self._extreme(counts, position)
-        known = self.highest if highest else self.lowest
-        if known is None or (extreme.count > known.count if highest else extreme.count < known.count):
+        record = self.highest if highest else self.lowest
+        if record is None or (extreme.count > record.count if highest else extreme.count < record.count):
             if highest:
                 self.highest = extreme
             else:

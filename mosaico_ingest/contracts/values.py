@@ -387,12 +387,12 @@ class Unchanged:
             return
         self.count += len(data)
         null = np.zeros(len(data), bool) if values.null is None else values.null
-        changed = np.ones(len(data), bool)
-        changed[1:] = ~_same(data[1:], data[:-1], null[1:], null[:-1])
+        is_new = np.ones(len(data), bool)
+        is_new[1:] = ~_same(data[1:], data[:-1], null[1:], null[:-1])
         if self._last is not None:
             previous = np.array([self._value], data.dtype)
-            changed[0] = not bool(_same(data[:1], previous, null[:1], np.array([self._is_null]))[0])
-        starts = np.flatnonzero(changed)
+            is_new[0] = not bool(_same(data[:1], previous, null[:1], np.array([self._is_null]))[0])
+        starts = np.flatnonzero(is_new)
         times, indexes = batch.log_times, batch.indexes
         if self._last is not None and len(starts):
             ends = starts - 1

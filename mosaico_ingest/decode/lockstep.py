@@ -321,10 +321,10 @@ class _LockstepWalk:
         is_correct = (inner.pos == ends) & ~trial.is_invalid
         firsts = np.cumsum(width) - width
         accepted = np.minimum.reduceat(np.where(is_correct, np.repeat(width, width), number), firsts)
-        kept = np.flatnonzero(number < np.repeat(accepted, width))
-        if len(kept) < len(owner):
-            offsets = tuple(step.take(kept) for step in offsets)
-        elements.add(offsets, owner[kept], elements.done[owner[kept]] + number[kept])
+        correct = np.flatnonzero(number < np.repeat(accepted, width))
+        if len(correct) < len(owner):
+            offsets = tuple(step.take(correct) for step in offsets)
+        elements.add(offsets, owner[correct], elements.done[owner[correct]] + number[correct])
         elements.done[rows] += accepted
         cursor.pos[rows] += accepted * size
         speculation.record_result(rows, accepted == width)
@@ -341,8 +341,8 @@ class _LockstepWalk:
             cursor.pos[index] = end
             if valid < remaining:
                 self._invalidate(cursor, np.arange(len(elements.count)) == index)
-        added = elements.done[active] - before
-        elements.add(recorder.offsets(), np.repeat(active, added), expand_ranges(before, added))
+        counts = elements.done[active] - before
+        elements.add(recorder.offsets(), np.repeat(active, counts), expand_ranges(before, counts))
 
     def _read_counts(self, cursor: _Cursor, step: Step, bound: int = 0) -> Int64s:
         """Read the length word of each message, and check it against the remaining bytes."""

@@ -114,12 +114,12 @@ class MessageWalker:
         """Record up to `count` elements of a message's loop; return the number of valid ones and the position after."""
         self._origin, self._end = int(self._payloads.origins[row]), int(self._payloads.ends[row])
         before = len(recorder)
-        for done in range(count):
+        for count_done in range(count):
             try:
                 pos = self._walk_body(recorder, pos)
             except _InvalidMessage:  # noqa: PERF203 - ends the loop
-                recorder.truncate(before + done)
-                return done, pos
+                recorder.truncate(before + count_done)
+                return count_done, pos
         return count, pos
 
     def _is_tail_valid(self, pos: int) -> bool:

@@ -171,9 +171,11 @@ def _values(job: Job, texts: Mapping[str, str]) -> dict[str, Any]:
 
     `_` replaces characters that the platform rejects in keys, and empty keys are dropped.
     """
-    named = {name: text for key, text in texts.items() if (name := _REFUSED.sub("_", key))}
+    texts_by_key = {name: text for key, text in texts.items() if (name := _REFUSED.sub("_", key))}
     path = job.sequence.metadata_schema
-    return with_required_types(load_schema(Path(path)), named) if path is not None else dict(named)
+    return (
+        with_required_types(load_schema(Path(path)), texts_by_key) if path is not None else dict(texts_by_key)
+    )
 
 
 def _file_name(job: Job, pattern: FileNamePattern, path: AnyPath) -> _Addition:

@@ -121,17 +121,17 @@ def _struct_fill(fields: list[pa.Field[Any]]) -> _Fill | None:
     ]
 
     def fill_struct(array: Any) -> Any:  # noqa: ANN401 - an Arrow array
-        changed: dict[int, Any] = {}
+        new_children: dict[int, Any] = {}
         for position, fill, nullable in watched:
             child = array.field(position)
             new = child if fill is None else fill(child)
             if not nullable and child.null_count:
                 new = _without_nulls(new)
             if new is not child:
-                changed[position] = new
-        if not changed:
+                new_children[position] = new
+        if not new_children:
             return array
-        children = [changed[i] if i in changed else array.field(i) for i in range(len(fields))]
+        children = [new_children[i] if i in new_children else array.field(i) for i in range(len(fields))]
         mask = pc.is_null(array) if array.null_count else None
         return pa.StructArray.from_arrays(children, fields=fields, mask=mask)
 

@@ -106,7 +106,7 @@ class StoreBrowser:
             after=values.get("after"),
             limit=PAGE_SIZE,
         )
-        kept = f"q={quote(values.get('q', ''))}{'&incomplete=on' if incomplete else ''}"
+        parameters = f"q={quote(values.get('q', ''))}{'&incomplete=on' if incomplete else ''}"
         return render(
             "browse.html",
             store=self._location,
@@ -114,8 +114,8 @@ class StoreBrowser:
             query=values.get("q", ""),
             incomplete=incomplete,
             is_first="after" not in values,
-            first_link=f"/?{kept}",
-            next_link=f"/?{kept}&after={quote(listing.next_after)}" if listing.next_after else None,
+            first_link=f"/?{parameters}",
+            next_link=f"/?{parameters}&after={quote(listing.next_after)}" if listing.next_after else None,
             links={each.name: sequence_link(each.name) for each in listing.sequences},
             runs_link=RUNS,
             version=__version__,

@@ -71,16 +71,16 @@ def picture_strip(topic: TopicInfo) -> Strip:
     """Return the pictures of rows at equal distances in time, with the reason for each picture that cannot be shown."""
     is_image = has_images(topic.schema)
     if is_image:
-        shown = thumbnails(topic, IMAGES, width=WIDTH, height=HEIGHT)
+        previews = thumbnails(topic, IMAGES, width=WIDTH, height=HEIGHT)
     else:
-        shown = thumbnails(topic, CLOUDS, width=CLOUD_SIZE, height=CLOUD_SIZE)
+        previews = thumbnails(topic, CLOUDS, width=CLOUD_SIZE, height=CLOUD_SIZE)
     pictures: list[Picture] = []
-    for each in shown:
+    for each in previews:
         if each.pixels is not None:
             source = _jpeg_url(each.pixels) if is_image else _png_url(each.pixels)
             time = time_text(each.time_ns)
             pictures.append(Picture(source, time.partition(" ")[2], f"{topic.name} at {time} UTC"))
-    problems = dict.fromkeys(each.problem for each in shown if each.problem is not None)
+    problems = dict.fromkeys(each.problem for each in previews if each.problem is not None)
     return Strip(topic.name, tuple(pictures), tuple(problems))
 
 
@@ -124,8 +124,8 @@ def draw_map(track: Track) -> Map | None:
 def _path(points: np.typing.NDArray[np.float64]) -> str:
     """Return a path of the points without repetitions."""
     texts = [f"{x:.1f} {y:.1f}" for x, y in points.tolist()]
-    kept = [text for at, text in enumerate(texts) if not at or text != texts[at - 1]]
-    return f"M{'L'.join(kept)}" if len(kept) > 1 else ""
+    vertices = [text for at, text in enumerate(texts) if not at or text != texts[at - 1]]
+    return f"M{'L'.join(vertices)}" if len(vertices) > 1 else ""
 
 
 def _grid(step: float) -> str:

@@ -93,20 +93,20 @@ def topic_plots(topic: TopicInfo, start_ns: int) -> TopicPlots | None:
     plots = list(_plots(groups, start_ns))[:MAX_PLOTS]
     if not plots:
         return None
-    shown = sum(len(members[:MAX_SERIES]) for members in list(groups.values())[:MAX_PLOTS])
-    omitted = sum(map(len, groups.values())) - shown + len(columns[MAX_COLUMNS:])
+    series_count = sum(len(members[:MAX_SERIES]) for members in list(groups.values())[:MAX_PLOTS])
+    omitted = sum(map(len, groups.values())) - series_count + len(columns[MAX_COLUMNS:])
     content = pack([data for _, data in plots])
     return TopicPlots(topic.name, tuple(plot for plot, _ in plots), content, omitted, tuple(constant))
 
 
 def _plots(groups: dict[tuple[str, str], list[Series]], start_ns: int) -> Iterable[tuple[Plot, str]]:
     for (title, unit), members in groups.items():
-        shown = members[:MAX_SERIES]
+        series = members[:MAX_SERIES]
         words = ", ".join(
             f"{one.label} from {_text(np.nanmin(one.values))} to {_text(np.nanmax(one.values))}"
-            for one in shown
+            for one in series
         )
-        data = {"unit": unit, "tables": [_table(one, title, start_ns) for one in shown]}
+        data = {"unit": unit, "tables": [_table(one, title, start_ns) for one in series]}
         full_title = f"{title} ({unit})" if unit else title
         yield Plot(full_title, f"Plot over time: {words}"), json.dumps(data, separators=(",", ":"))
 

@@ -173,8 +173,8 @@ class RecordingView:
     @property
     def size(self) -> str:
         """The size of the files, and the stored size."""
-        source, stored = self.report.source_bytes, self.totals.stored_bytes
-        return stored_text(source, stored) if stored else bytes_text(source)
+        source, stored_bytes = self.report.source_bytes, self.totals.stored_bytes
+        return stored_text(source, stored_bytes) if stored_bytes else bytes_text(source)
 
     @property
     def messages_per_s(self) -> int:

@@ -66,10 +66,10 @@ class ReportFolder:
         return sorted(files, key=lambda file: file[1], reverse=True)
 
     def _summary(self, path: Path, signature: Signature) -> RunSummary:
-        known = self._summaries.get(path.name)
-        if known is None or known[0] != signature:
-            known = self._summaries[path.name] = (signature, _summary(path))
-        return known[1]
+        cached = self._summaries.get(path.name)
+        if cached is None or cached[0] != signature:
+            cached = self._summaries[path.name] = (signature, _summary(path))
+        return cached[1]
 
 
 def _summary(path: Path) -> RunSummary:

@@ -53,7 +53,7 @@ def run_page(
     `list_link` is the address of the list of runs of a web server, which has no links to files.
     """
     several = len(report.recordings) > 1
-    started = report.summary.started_at
+    started_at = report.summary.started_at
     expectations = contract_summaries(report.recordings)
     return render(
         "run.html",
@@ -64,7 +64,7 @@ def run_page(
         expectations=expectations[:MAX_RESULTS],
         expectation_count=len(expectations),
         comparison=comparison,
-        started_at=f"{started:%Y-%m-%d %H:%M:%S}" if started else None,
+        started_at=f"{started_at:%Y-%m-%d %H:%M:%S}" if started_at else None,
         totals=_totals(report),
         steps=_steps(report),
         writer_s=report.summary.steps.write,
@@ -97,10 +97,8 @@ def verdict_of(recordings: Sequence[Report]) -> Verdict:
         "already stored before": skipped,
     }
     parts = [f"{count_text(count)} {words}" for words, count in counts.items() if count]
-    written = counted(sum(one.totals.written for one in recordings), "message")
-    text = (
-        f"{counted(len(recordings), 'recording')}{': ' if parts else ''}{', '.join(parts)}; {written} written"
-    )
+    message_text = counted(sum(one.totals.written for one in recordings), "message")
+    text = f"{counted(len(recordings), 'recording')}{': ' if parts else ''}{', '.join(parts)}; {message_text} written"
     if failed:
         title = "The run failed" if failed == len(recordings) else "The run failed for some recordings"
         return Verdict("bad", title, text)
@@ -117,18 +115,18 @@ def verdict_of(recordings: Sequence[Report]) -> Verdict:
 def _totals(report: RunReport) -> dict[str, str]:
     summary = report.summary
     source_bytes, stored_bytes = summary.source_bytes, summary.stored_bytes
-    seconds, read = summary.duration_s, summary.read
+    seconds, message_count = summary.duration_s, summary.read
     share = f" ({percent_text(stored_bytes / source_bytes)})" if source_bytes else ""
     return {
         "Recordings": count_text(len(report.recordings)),
-        "Messages read": count_text(read),
+        "Messages read": count_text(message_count),
         "Written": count_text(summary.written),
         "Rejected": count_text(summary.rejected),
         "Unreadable": unreadable_text(report.recordings),
         "Recorded": bytes_text(source_bytes),
         "Stored": f"{bytes_text(stored_bytes)}{share}",
         "Working time": seconds_text(seconds),
-        "Messages / s": count_text(round(read / seconds)) if seconds else "",
+        "Messages / s": count_text(round(message_count / seconds)) if seconds else "",
     }
 
 

@@ -75,10 +75,10 @@ class Track(Struct, frozen=True):
 
 def time_axis(times_ns: Iterable[int]) -> Axis | None:
     """Return the axis from the smallest to the largest time; None without times."""
-    known = sorted(times_ns)
-    if not known:
+    times = sorted(times_ns)
+    if not times:
         return None
-    start_ns, end_ns = known[0], known[-1]
+    start_ns, end_ns = times[0], times[-1]
     duration_s = (end_ns - start_ns) / 1e9
     step_s = next((step for step in STEPS_S if step * MAX_TICKS >= duration_s), None)
     if step_s is None:

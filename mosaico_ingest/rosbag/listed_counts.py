@@ -35,23 +35,23 @@ def add_missing_messages(
     reading; see `missing_after_reading`.
     """
     explained = sum(item.count or 0 for item in unreadable if item.connection is None)
-    changed = list(connections)
+    new_connections = list(connections)
     missing: list[UnreadableRange] = []
     of_topic: dict[str, list[Connection]] = defaultdict(list)
     for connection in connections:
         of_topic[connection.topic].append(connection)
     for topic, count in listed.items():
         counts = [connection.count for connection in of_topic[topic]]
-        difference = count - sum(known or 0 for known in counts)
+        difference = count - sum(number or 0 for number in counts)
         if None in counts or difference <= explained:
             explained -= max(difference, 0) if None not in counts else 0
             continue
         difference, explained = difference - explained, 0
         first = of_topic[topic][0] if of_topic[topic] else None
         if first is not None:
-            changed[first.id] = replace(first, count=(first.count or 0) + difference)
+            new_connections[first.id] = replace(first, count=(first.count or 0) + difference)
         missing.append(_missing(topic, count, difference, first, file))
-    return tuple(changed), missing
+    return tuple(new_connections), missing
 
 
 def missing_after_reading(
@@ -66,18 +66,18 @@ def missing_after_reading(
 
     Unreadable ranges of unknown size or topic already explain any difference.
     """
-    lost: Counter[int] = Counter()
+    unreadable_counts: Counter[int] = Counter()
     for item in unreadable:
         if item.count is None or (item.connection is None and item.count):
             return []
         if item.connection is not None:
-            lost[item.connection] += item.count
+            unreadable_counts[item.connection] += item.count
     missing: list[UnreadableRange] = []
     for topic, count in listed.items():
         matching = [connection for connection in connections if connection.topic == topic]
         if not any(connection.count is None for connection in matching):
             continue
-        difference = count - sum(read.get(each.id, 0) + lost[each.id] for each in matching)
+        difference = count - sum(read.get(each.id, 0) + unreadable_counts[each.id] for each in matching)
         if difference > 0 and all(each.id in read for each in matching):
             missing.append(_missing(topic, count, difference, matching[0], file))
     return missing

@@ -161,9 +161,9 @@ class Recording:
         self.size_bytes: int = sum(file.stat().st_size for file in files.files)
         self._listed = {} if unreadable else listed_counts(files)
         self._metadata_path = "" if files.metadata is None else str(files.metadata.path)
-        lost = [gap for split in splits for gap in split.unreadable]
+        gaps = [gap for split in splits for gap in split.unreadable]
         self.connections, missing = add_missing_messages(
-            self._table.connections, self._listed, lost, file=self._metadata_path
+            self._table.connections, self._listed, gaps, file=self._metadata_path
         )
         self.start_ns: int | None = min((s.start_ns for s in splits if s.start_ns is not None), default=None)
         self.end_ns: int | None = max((s.end_ns for s in splits if s.end_ns is not None), default=None)
@@ -302,8 +302,8 @@ class Recording:
         }
         coalescer = BlockCoalescer(max_rows=max_rows, memory_bytes=memory_bytes)
         is_unlimited = first <= EARLIEST_NS and end > LATEST_NS
-        read = dict.fromkeys(ids, 0) if is_unlimited else None
-        iterator = self._coalesced(requests, coalescer, observe, read)
+        counts = dict.fromkeys(ids, 0) if is_unlimited else None
+        iterator = self._coalesced(requests, coalescer, observe, counts)
         self._iterators.add(iterator)
         return iterator
 
@@ -318,8 +318,8 @@ class Recording:
         parts: dict[int, list[Int64s]] = {key: [] for key in connection_ids}
         for number, split in enumerate(self._splits):
             keys = self._table.split_connections(number, connection_ids)
-            read = getattr(split, "index_times", None)
-            times = read(keys) if read is not None else None
+            read_times = getattr(split, "index_times", None)
+            times = read_times(keys) if read_times is not None else None
             if times is None:
                 return None
             for key, arrays in times.items():
@@ -336,23 +336,23 @@ class Recording:
         requests: dict[int, ReadRequest],
         coalescer: BlockCoalescer,
         observe: BlockObserver | None,
-        read: dict[int, int] | None,
+        counts: dict[int, int] | None,
     ) -> Generator[MessageBlock, None, None]:
         """Yield blocks; count their messages in `read`, which is None if the request is limited in time."""
         with results_in_order(self._loads(requests, observe), threads=self._reader_threads()) as loaded_tasks:
             for loaded in loaded_tasks:
                 self._report(loaded.split, loaded.unreadable)
                 for block in loaded.blocks:
-                    if read is not None:
-                        read[block.connection] += len(block)
+                    if counts is not None:
+                        counts[block.connection] += len(block)
                     yield from coalescer.add(block, loaded.start_ns)
                 yield from coalescer.flush_ready(loaded.next_ns)
             for number in requests:
                 self._splits[number].check_unchanged()
             yield from coalescer.flush_all()
-        if read is not None and self._listed:
+        if counts is not None and self._listed:
             missing = missing_after_reading(
-                self.connections, self._listed, read, self.unreadable, file=self._metadata_path
+                self.connections, self._listed, counts, self.unreadable, file=self._metadata_path
             )
             self._unreadable |= dict.fromkeys(missing)
 
@@ -617,13 +617,13 @@ def _connection_findings(connections: Sequence[Connection]) -> Iterator[Finding]
 
 
 def _metadata_differences(connections: Sequence[Connection], metadata: Metadata) -> Iterator[str]:
-    stored: dict[str, list[Connection]] = defaultdict(list)
+    connections_by_topic: dict[str, list[Connection]] = defaultdict(list)
     for connection in connections:
-        stored[connection.topic].append(connection)
+        connections_by_topic[connection.topic].append(connection)
     for topic in metadata.topics:
-        for difference in _topic_differences(topic, stored.pop(topic.topic, [])):
+        for difference in _topic_differences(topic, connections_by_topic.pop(topic.topic, [])):
             yield f"{topic.topic}: {difference}"
-    for topic, unlisted in stored.items():
+    for topic, unlisted in connections_by_topic.items():
         if any(connection.count != 0 for connection in unlisted):
             yield f"{topic} is not in the metadata"
 

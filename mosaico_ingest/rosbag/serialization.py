@@ -145,14 +145,14 @@ class Deserializer:
         return f"use the definition of {distro}, which matches the bytes" if distro else None
 
     def _check_tail(self, cursor: _Cursor) -> None:
-        left = cursor.left
-        if left <= (_MAX_PADDING if self._cdr else 0):
+        remaining = cursor.left
+        if remaining <= (_MAX_PADDING if self._cdr else 0):
             return
-        if self._cdr and left <= _MAX_ZEROS and not any(cursor.data[cursor.pos :]):
+        if self._cdr and remaining <= _MAX_ZEROS and not any(cursor.data[cursor.pos :]):
             self.padded += 1
             return
         raise DecodeError(
-            f"{left} bytes remain after the last field of {self._definition.root}, whose definition is from "
+            f"{remaining} bytes remain after the last field of {self._definition.root}, whose definition is from "
             f"{_ORIGINS[self._definition.source]}",
             rule="trailing-bytes",
         )
@@ -162,8 +162,8 @@ class Deserializer:
 def _distro_readers(
     msgtype: str, ros_version: int, encoding: Encoding
 ) -> tuple[tuple[str, Mapping[str, MessageType], Deserializer], ...]:
-    known = distro_definitions(msgtype, ros_version)
-    return tuple((distro, other.types, Deserializer(other, encoding)) for distro, other in known)
+    definitions = distro_definitions(msgtype, ros_version)
+    return tuple((distro, other.types, Deserializer(other, encoding)) for distro, other in definitions)
 
 
 _OTHER_ENCODINGS = frozenset({"encapsulation", "pl-cdr", "xcdr2"})

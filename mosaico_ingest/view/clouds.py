@@ -161,12 +161,12 @@ def _packed_points(row: Mapping[str, Any]) -> Points:
             f"{width} x {height} points of {step} bytes do not fit into {data.size} bytes with rows of {row_step}"
         )
     order = ">" if row["is_bigendian"] else "<"
-    chosen = [name for name in ("x", "y", "z", "intensity") if name in layout]
-    kinds = [f"{order}{_NUMPY_TYPES[int(layout[name]['datatype']) - 1]}" for name in chosen]
-    offsets = [int(layout[name]["offset"]) for name in chosen]
+    names = [name for name in ("x", "y", "z", "intensity") if name in layout]
+    kinds = [f"{order}{_NUMPY_TYPES[int(layout[name]['datatype']) - 1]}" for name in names]
+    offsets = [int(layout[name]["offset"]) for name in names]
     if any(at + np.dtype(kind).itemsize > step for at, kind in zip(offsets, kinds, strict=True)):
         raise ViewError(f"a field ends after the {step} bytes of a point")
-    point = np.dtype({"names": chosen, "formats": kinds, "offsets": offsets, "itemsize": step})
+    point = np.dtype({"names": names, "formats": kinds, "offsets": offsets, "itemsize": step})
     rows = [np.frombuffer(row["data"], point, count=width, offset=line * row_step) for line in range(height)]
     points = rows[0] if height == 1 else np.concatenate(rows)
     return _finite([points[axis] for axis in "xyz"], points["intensity"] if "intensity" in layout else None)

@@ -82,8 +82,10 @@ def _kind(schema: pa.Schema) -> str | None:
 def log_lines(topic: TopicInfo) -> Iterator[LogLine]:
     """Yield the lines of the first `MAX_ROWS` rows in order of time; none if the topic has no lines."""
     kind = _kind(topic.schema)
-    used = {"log": ["level", "name", "msg"], "diagnostics": ["status"], "text": ["data"]}.get(kind or "", [])
-    names = [topic.schema.names[0], *(name for name in used if name in topic.schema.names)]
+    fields = {"log": ["level", "name", "msg"], "diagnostics": ["status"], "text": ["data"]}.get(
+        kind or "", []
+    )
+    names = [topic.schema.names[0], *(name for name in fields if name in topic.schema.names)]
     schema = pa.schema([topic.schema.field(name) for name in names])
     rows = 0
     for batch in scan(topic.segments, schema, Window()) if kind else ():

@@ -88,8 +88,8 @@ def rows_near(topic: TopicInfo, times_ns: Sequence[int], *, columns: Sequence[st
     groups = list(_row_groups(topic.segments))
     nearest = {_nearest(groups, at_ns, schema.names[0]) for at_ns in times_ns} - {None}
     tables = [schema.empty_table()]
-    for group in dict.fromkeys(found[0] for found in nearest if found is not None):
-        rows = sorted(found[1] for found in nearest if found is not None and found[0] is group)
+    for group in dict.fromkeys(position[0] for position in nearest if position is not None):
+        rows = sorted(position[1] for position in nearest if position is not None and position[0] is group)
         tables.append(_read(group, schema).take(pa.array(rows)))
     return pa.concat_tables(tables).sort_by(schema.names[0])
 

@@ -84,14 +84,14 @@ def read_series(
     Raises:
         ViewError: A field does not exist or has no numbers; the hint names existing ones.
     """
-    chosen = [field for name in fields for field in _expanded(topic, name)]
-    names = dict.fromkeys([topic.schema.names[0], *(field.column.name for field in chosen)])
+    series_fields = [field for name in fields for field in _expanded(topic, name)]
+    names = dict.fromkeys([topic.schema.names[0], *(field.column.name for field in series_fields)])
     schema = pa.schema([topic.schema.field(name) for name in names])
     group = max(1, 2 * topic.rows // max(2, max_points))
-    envelopes = [_Envelope(group) for _ in chosen]
+    envelopes = [_Envelope(group) for _ in series_fields]
     for batch in scan(topic.segments, schema, Window(start_ns, end_ns)):
         times = batch.column(0).to_numpy()
-        for field, envelope in zip(chosen, envelopes, strict=True):
+        for field, envelope in zip(series_fields, envelopes, strict=True):
             envelope.add(times, field.values(batch))
     tag = topic.ontology.tag
     return [
@@ -100,7 +100,7 @@ def read_series(
             "s" if field.column.is_time else column_unit(tag, field.column.path),
             *envelope.points(),
         )
-        for field, envelope in zip(chosen, envelopes, strict=True)
+        for field, envelope in zip(series_fields, envelopes, strict=True)
     ]
 
 
@@ -160,14 +160,14 @@ def _expanded(topic: TopicInfo, name: str) -> Iterator[_Field]:
     ]
     measurements = [each for each in members if _is_measurement(each)] or members
     if not measurements:
-        known = [
+        paths = [
             path for path, each in columns.items() if _is_scalar(each.type) or _is_plotted_list(each.type)
         ]
         problem = "has no numbers" if column is not None else "does not exist"
         raise ViewError(
             f"the field {name!r} {problem}",
             where=f"{topic.sequence}{topic.name}",
-            hint=suggest_names([path for path in known if _is_measurement(columns[path])], [name]),
+            hint=suggest_names([path for path in paths if _is_measurement(columns[path])], [name]),
         )
     yield from map(_Field, measurements)
 

@@ -73,10 +73,10 @@ def read_track(topic: TopicInfo, *, max_points: int = 5_000) -> Track | None:
         selected = np.flatnonzero(valid)
         if len(selected) and not rows and source.frame is not None:
             frame_id = str(source.frame.values(batch)[int(selected[0])].as_py() or "")
-        chosen = selected[(-rows) % every :: every]
+        rows_of_track = selected[(-rows) % every :: every]
         rows += len(selected)
-        times.append(batch.column(0).to_numpy()[chosen])
-        positions.append(coordinates[chosen])
+        times.append(batch.column(0).to_numpy()[rows_of_track])
+        positions.append(coordinates[rows_of_track])
     empty_times, empty_positions = np.empty(0, np.int64), np.empty((0, 3))
     return Track(
         topic.name,
@@ -121,12 +121,12 @@ def _source(topic: TopicInfo) -> _Source | None:
 
 
 def _batches(topic: TopicInfo, source: _Source) -> Iterator[pa.RecordBatch]:
-    used = [
+    columns = [
         *source.axes,
         *([source.status] if source.status else []),
         *([source.frame] if source.frame else []),
     ]
-    names = dict.fromkeys([topic.schema.names[0], *(column.name for column in used)])
+    names = dict.fromkeys([topic.schema.names[0], *(column.name for column in columns)])
     return scan(topic.segments, pa.schema([topic.schema.field(name) for name in names]), Window())
 
 

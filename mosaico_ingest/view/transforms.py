@@ -54,9 +54,9 @@ def read_edges(topics: Iterable[TopicInfo]) -> list[FrameEdge]:
         schema = pa.schema([topic.schema.field(name) for name in (topic.schema.names[0], *names)])
         for batch in scan(topic.segments, schema, Window()):
             for parent, child, rows, translation in _batch_edges(batch, nested=nested):
-                known = counts.get((parent, child))
-                if known is not None:
-                    counts[parent, child] = (known[0], known[1] + rows, known[2])
+                edge = counts.get((parent, child))
+                if edge is not None:
+                    counts[parent, child] = (edge[0], edge[1] + rows, edge[2])
                 elif len(counts) < MAX_FRAMES:
                     counts[parent, child] = (topic.name, rows, translation)
     return [

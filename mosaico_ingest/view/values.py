@@ -196,5 +196,5 @@ def _members_text(members: Sequence[str], brackets: str, noun: str, width: int, 
         if length > width:
             break
         first.append(member)
-    shown = ", ".join((*first, "…")) if first or not members else f"{members[0][:width]}…"
-    return f"{brackets[0]}{shown}{brackets[1]} ({counted(count, noun)})"
+    members_text = ", ".join((*first, "…")) if first or not members else f"{members[0][:width]}…"
+    return f"{brackets[0]}{members_text}{brackets[1]} ({counted(count, noun)})"

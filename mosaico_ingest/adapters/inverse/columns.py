@@ -321,8 +321,8 @@ class ColumnInverter:
         metadata_text = self._metadata_texts.get(_field_path(typed, scope) or ())
         if metadata_text is None:
             return values
-        stored = function(arrays.array([metadata_text]))[0]
-        return pc.if_else(pc.equal(values, stored), arrays.scalar(metadata_text), values)
+        stored_value = function(arrays.array([metadata_text]))[0]
+        return pc.if_else(pc.equal(values, stored_value), arrays.scalar(metadata_text), values)
 
     def _choice(self, typed: Conditional, values: Array, scope: _Scope) -> None:
         if isinstance(typed.then, Constant):

@@ -275,8 +275,10 @@ class MessageBuilder:
                 continue
             elements, axis = open_list(array)
             rows = rows[axis.lengths[rows] > constraint.index]
-            changed = _with_values(elements, axis.offsets[:-1][rows] + constraint.index, constraint.of(rows))
-            array = axis.close(changed, array.type)
+            new_elements = _with_values(
+                elements, axis.offsets[:-1][rows] + constraint.index, constraint.of(rows)
+            )
+            array = axis.close(new_elements, array.type)
         return array
 
 

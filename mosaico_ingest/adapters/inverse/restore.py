@@ -160,8 +160,8 @@ class _MappingInverse(Struct, frozen=True):
         undo = ColumnInverter(builder, self.metadata_texts)
         undo.record(self.adapter.record, rows)
         messages = builder.build()
-        changed = _changed(self.adapter, rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
-        return Restored(messages, tuple(builder.defaulted), undo.not_invertible, changed)
+        counts = _changed(self.adapter, rows, messages, replace(envelope, msgtype=self.adapter.msgtype))
+        return Restored(messages, tuple(builder.defaulted), undo.not_invertible, counts)
 
 
 class _PythonInverse(Struct, frozen=True):
@@ -174,9 +174,11 @@ class _PythonInverse(Struct, frozen=True):
     """A typestore of rosbags; its type is not named here because only `rosbag` imports the library."""
 
     def restore(self, rows: pa.StructArray, envelope: Envelope) -> Restored:
-        stored: Any = rows  # the stubs lack to_pylist of struct arrays
+        struct_rows: Any = rows  # the stubs lack to_pylist of struct arrays
         times: list[int] = envelope.log_times.tolist()
-        messages = [self._message(row, time) for row, time in zip(stored.to_pylist(), times, strict=True)]
+        messages = [
+            self._message(row, time) for row, time in zip(struct_rows.to_pylist(), times, strict=True)
+        ]
         try:
             # The stubs do not derive the array class from the type.
             restored = cast("pa.StructArray", arrays.array(messages, self.shape))
@@ -201,11 +203,13 @@ class _PythonInverse(Struct, frozen=True):
 def _changed(adapter: Adapter, rows: Array, messages: Array, envelope: Envelope) -> Mapping[str, int]:
     """Return the columns that differ after the messages are adapted again, with the number of rows."""
     adapted = adapter.adapt(messages, envelope)
-    stored = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
-    changed = {name: int(wrong.sum()) for name, wrong in differences(stored, adapted.rows).items()}
+    stored_rows = rows if len(adapted.index) == len(rows) else rows.take(arrays.array(adapted.index))
+    counts_by_column = {
+        name: int(wrong.sum()) for name, wrong in differences(stored_rows, adapted.rows).items()
+    }
     dropped = sum(len(positions) for positions in adapted.dropped.values())
     counts = {"(refused)": len(adapted.failures), "(dropped)": dropped}
-    return changed | {name: count for name, count in counts.items() if count}
+    return counts_by_column | {name: count for name, count in counts.items() if count}
 
 
 def _presence_of(adapter: MappingAdapter, definition: Definition) -> Presence | None:

@@ -185,7 +185,7 @@ class Analyzer:
             return
         function = lookup(node.name)
         if function is None:
-            names = [*(known.name for known in functions()), *_SPECIAL_FORMS]
+            names = [*(entry.name for entry in functions()), *_SPECIAL_FORMS]
             hint = suggest_synonym(node.name) or suggest(node.name, names)
             message = f"there is no function {node.name!r}"
             self.report_inside(path, node.name_span, "unknown-function", message, hint)

@@ -107,11 +107,11 @@ def true_mask(values: Array | Scalar, *, null: bool = False) -> Mask:
     """Return where a boolean column is true, with nulls counted as `null`; shape (1,) for a scalar."""
     if isinstance(values, pa.Scalar):
         return np.array([values.as_py() if values.is_valid else null])
-    known = pc.fill_null(values, null) if values.null_count else values
-    trues = known.true_count
-    if trues in {0, len(known)}:
-        return np.full(len(known), trues > 0)
-    return np.asarray(known)
+    booleans = pc.fill_null(values, null) if values.null_count else values
+    trues = booleans.true_count
+    if trues in {0, len(booleans)}:
+        return np.full(len(booleans), trues > 0)
+    return np.asarray(booleans)
 
 
 def field_of(rows: Array, name: str) -> Array:
@@ -173,8 +173,8 @@ def null_where(array: Array, mask: Mask) -> Array:
     """Return the array with nulls where `mask` is true; struct fields keep their values, so nothing is copied."""
     if not mask.any():
         return array
-    known = null_mask(array)
-    null = mask if known is None else mask | known
+    nulls = null_mask(array)
+    null = mask if nulls is None else mask | nulls
     if pt.is_struct(array.type):
         children = [array.field(i) for i in range(array.type.num_fields)]
         return struct_of(children, array.type, null, len(array))
@@ -183,13 +183,13 @@ def null_where(array: Array, mask: Mask) -> Array:
 
 def promote(*values: Array) -> list[Array]:
     """Cast arrays or scalars to a common type; the checker guarantees that there is one."""
-    known = [v.type for v in values if not pt.is_null(v.type)]
-    if not known:
+    types = [v.type for v in values if not pt.is_null(v.type)]
+    if not types:
         return list(values)
-    both = known[0]
-    if any(t != both for t in known) and not pt.is_nested(both):
-        whole = arrays.uint64() if arrays.uint64() in known else arrays.int64()
-        both = arrays.float64() if any(pt.is_floating(t) for t in known) else whole
+    both = types[0]
+    if any(t != both for t in types) and not pt.is_nested(both):
+        whole = arrays.uint64() if arrays.uint64() in types else arrays.int64()
+        both = arrays.float64() if any(pt.is_floating(t) for t in types) else whole
     return [_in_type(v, both) for v in values]
 
 

@@ -313,13 +313,13 @@ class Evaluation:
         with self.within(Column(pc.invert(condition.values), condition.axes)):
             otherwise = self.evaluate(typed.otherwise)
         columns, axes = self._aligned([condition, then, otherwise], typed.text)
-        chosen = columns[0].values
+        mask = columns[0].values
         branches = promote(columns[1].values, columns[2].values)
-        if isinstance(chosen, pa.BooleanArray) and not chosen.null_count:
-            only = {0: branches[1], len(chosen): branches[0]}.get(chosen.true_count)
+        if isinstance(mask, pa.BooleanArray) and not mask.null_count:
+            only = {0: branches[1], len(mask): branches[0]}.get(mask.true_count)
             if isinstance(only, pa.Array):
                 return Column(only, axes)
-        return Column(pc.if_else(chosen, *branches), axes)
+        return Column(pc.if_else(mask, *branches), axes)
 
 
 def reject_by_rule(rejections: Mapping[int, Rejection], count: int, refuse: RejectRows) -> None:

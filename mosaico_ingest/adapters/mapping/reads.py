@@ -37,17 +37,17 @@ _Scopes: TypeAlias = "tuple[ReadPath, ...]"
 """The paths of the messages around an expression, outermost first; names are looked up in the last one."""
 
 
-def unread_paths(shape: DataType, read: set[ReadPath], at: ReadPath = ()) -> Iterator[ReadPath]:
+def unread_paths(shape: DataType, reads: set[ReadPath], at: ReadPath = ()) -> Iterator[ReadPath]:
     """Yield the fields of a message that are not among the fields read; a struct of unread fields is one field."""
     for field in shape:
         path = (*at, field.name)
-        if any(path[:length] in read for length in range(len(path) + 1)):
+        if any(path[:length] in reads for length in range(len(path) + 1)):
             continue
         element = field.type
         while is_list(element):
             element = element.value_type
-        if pt.is_struct(element) and any(path_read[: len(path)] == path for path_read in read):
-            yield from unread_paths(element, read, path)
+        if pt.is_struct(element) and any(path_read[: len(path)] == path for path_read in reads):
+            yield from unread_paths(element, reads, path)
         else:
             yield path
 

@@ -106,9 +106,9 @@ def common_type(expr_types: list[ExprType]) -> ExprType:
         TypeMismatch: The types have nothing in common.
     """
     first = next((expr_type for expr_type in expr_types if not pt.is_null(expr_type.arrow)), expr_types[0])
-    known = [expr_type for expr_type in expr_types if not pt.is_null(expr_type.arrow)] or [first]
-    if all(is_number(expr_type.arrow) for expr_type in known):
-        return _join_numbers(known)
+    types = [expr_type for expr_type in expr_types if not pt.is_null(expr_type.arrow)] or [first]
+    if all(is_number(expr_type.arrow) for expr_type in types):
+        return _join_numbers(types)
     for position, expr_type in enumerate(expr_types):
         if not pt.is_null(expr_type.arrow) and expr_type.arrow != first.arrow:
             raise TypeMismatch(

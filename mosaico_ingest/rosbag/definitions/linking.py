@@ -77,21 +77,21 @@ def _candidate_names(name: str, owner: str, ros_version: int) -> list[str]:
     return [*dict.fromkeys(names), HEADER] if name == "Header" else list(dict.fromkeys(names))
 
 
-def _leaves(name: str, types: Mapping[str, MessageType], known: dict[str, int], *, depth: int) -> int:
+def _leaves(name: str, types: Mapping[str, MessageType], counts: dict[str, int], *, depth: int) -> int:
     """Return the number of columns of a type; a few lines of nested arrays could define millions of them."""
-    if depth > _MAX_DEPTH or known.get(name) == 0:
-        reason = "contains itself" if known.get(name) == 0 else f"is nested more than {_MAX_DEPTH} deep"
+    if depth > _MAX_DEPTH or counts.get(name) == 0:
+        reason = "contains itself" if counts.get(name) == 0 else f"is nested more than {_MAX_DEPTH} deep"
         raise BagError(f"{name} {reason}", where=name)
-    if name not in known:
-        known[name] = 0
+    if name not in counts:
+        counts[name] = 0
         count = 1
         for field in types[name].fields:
-            each = _leaves(field.type, types, known, depth=depth + 1) if field.is_message else 1
+            each = _leaves(field.type, types, counts, depth=depth + 1) if field.is_message else 1
             count += each * (field.size if field.container is Container.ARRAY and field.is_message else 1)
         if count > _MAX_LEAVES:
             raise BagError(f"{count} fields exceed the limit of {_MAX_LEAVES}", where=name)
-        known[name] = count
-    return known[name]
+        counts[name] = count
+    return counts[name]
 
 
 NUMBERS = {

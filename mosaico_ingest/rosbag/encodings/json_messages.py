@@ -74,5 +74,5 @@ class JsonCodec:
             raise DecodeError(text, rule="json-schema") from None
         if error is not None:
             reason = f"{error.json_path}: {error.message}"
-            shown = reason if len(reason) <= _MAX_REASON else f"{reason[:_MAX_REASON]}…"
-            raise DecodeError(f"{shown} ({error.validator})", rule="json-schema")
+            short_reason = reason if len(reason) <= _MAX_REASON else f"{reason[:_MAX_REASON]}…"
+            raise DecodeError(f"{short_reason} ({error.validator})", rule="json-schema")

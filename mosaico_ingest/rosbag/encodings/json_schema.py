@@ -200,11 +200,11 @@ def _without_null(node: dict[str, Any]) -> dict[str, Any]:
 
 def _kinds_of(node: Mapping[str, Any]) -> set[str]:
     """Return the types of JSON values that a schema allows, except null; empty if it does not name them."""
-    named = node.get("type")
-    if isinstance(named, str):
-        return {named} - {"null"}
-    if isinstance(named, list):
-        return {str(one) for one in cast("list[Any]", named)} - {"null"}
+    type_names = node.get("type")
+    if isinstance(type_names, str):
+        return {type_names} - {"null"}
+    if isinstance(type_names, list):
+        return {str(one) for one in cast("list[Any]", type_names)} - {"null"}
     if "properties" in node:
         return {"object"}
     values = _allowed_values(node)
@@ -296,8 +296,8 @@ class _Confirming:
         values = _allowed_values(node)
         if values:
             return self._literal(node, values)
-        named = node.pop("type", "object" if "properties" in node else None)
-        kinds = cast("list[str]", named if isinstance(named, list) else [named])
+        type_names = node.pop("type", "object" if "properties" in node else None)
+        kinds = cast("list[str]", type_names if isinstance(type_names, list) else [type_names])
         others = [kind for kind in kinds if kind != "null"]
         if len(others) > 1 and node:
             raise _Unconfirmable

@@ -110,12 +110,12 @@ def _descriptor(name: str, text: str) -> Descriptor:
 
 def _add_files(pool: Any, files: dict[str, Any]) -> None:  # noqa: ANN401 - a DescriptorPool
     """Add files to a pool, each after the files that it imports."""
-    added: set[str] = set()
+    paths: set[str] = set()
 
     def add(path: str) -> None:
-        if path in added:
+        if path in paths:
             return
-        added.add(path)
+        paths.add(path)
         file = files.get(path) or _well_known(path)
         for imported in file.dependency:
             add(imported)

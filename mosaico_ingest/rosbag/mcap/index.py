@@ -119,17 +119,17 @@ def read_extents(
     source: Source, index: McapIndex, max_chunk_bytes: int = MAX_CHUNK_BYTES
 ) -> tuple[list[Extent], list[UnreadableRange]]:
     """Return all extents by time, also extents that the summary lacks, and damage between chunks."""
-    listed = sorted(index.extents, key=lambda extent: extent.offset)
+    index_extents = sorted(index.extents, key=lambda extent: extent.offset)
     unlisted = McapIndex()
     position = len(MCAP)
     if not index.is_walked:
         walk = _Walk(source, unlisted, max_chunk_bytes)
-        for extent in listed:
+        for extent in index_extents:
             if extent.offset > position:
                 walk.over(position, extent.offset)
             position = max(position, extent.stop)
         walk.over(position, index.data_end)
-    return sorted(listed + unlisted.extents, key=lambda extent: extent.start_ns), unlisted.unreadable
+    return sorted(index_extents + unlisted.extents, key=lambda extent: extent.start_ns), unlisted.unreadable
 
 
 class KeptRecords(Struct, frozen=True):

@@ -263,8 +263,8 @@ def suggest_synonym(name: str) -> str | None:
     instead = _INSTEAD.get(name.lower())
     if instead is not None:
         return f"write {instead}"
-    known = _FUNCTIONS.get(_BY_SYNONYM.get(name.lower(), ""))
-    return f"use {known.signature}: {known.summary.rstrip('.')}" if known else None
+    synonym = _FUNCTIONS.get(_BY_SYNONYM.get(name.lower(), ""))
+    return f"use {synonym.signature}: {synonym.summary.rstrip('.')}" if synonym else None
 
 
 def set_null(values: Any, mask: Mask) -> Any:  # noqa: ANN401 - an Arrow array or scalar

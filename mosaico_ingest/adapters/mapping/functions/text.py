@@ -95,8 +95,8 @@ def split(s: Array, separator: str) -> Array:
 
 def _grouped(pattern: str) -> str:
     """Return a pattern with its first group, or else all of it, as a named group: Arrow returns named groups only."""
-    named, count = re.subn(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
-    return named if count else f"(?P<part>{pattern})"
+    renamed_pattern, count = re.subn(r"(?<!\\)\((?!\?)", "(?P<part>", pattern, count=1)
+    return renamed_pattern if count else f"(?P<part>{pattern})"
 
 
 def _pattern_problem(pattern: str) -> str | None:
