@@ -173,7 +173,7 @@ class Tally:
     def remaining_s(self) -> float | None:
         """Estimated seconds until the end, or None if there is no estimate yet.
 
-        Recordings that were skipped or failed immediately do not count towards the speed.
+        Recordings that were skipped or failed immediately do not count toward the speed.
         """
         read_bytes = self._read_bytes() - self._unread_bytes
         remaining_bytes = sum(self.sizes) - self._read_bytes()

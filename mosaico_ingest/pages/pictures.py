@@ -14,7 +14,7 @@ from mosaico_ingest.report.units import time_text
 from mosaico_ingest.view.clouds import grid_step
 from mosaico_ingest.view.images import Pixels, has_images, png_bytes
 from mosaico_ingest.view.pictures import thumbnails
-from mosaico_ingest.view.tracks import Track, local_metres
+from mosaico_ingest.view.tracks import Track, local_meters
 
 IMAGES = 12
 """Thumbnails of a camera topic."""
@@ -86,7 +86,7 @@ def picture_strip(topic: TopicInfo) -> Strip:
 
 def draw_map(track: Track) -> Map | None:
     """Return the map of a track; None if it has fewer than two different positions."""
-    meters = local_metres(track)
+    meters = local_meters(track)
     meters = meters[np.isfinite(meters).all(axis=1)]
     if not len(meters) or (meters == meters[0]).all():
         return None

@@ -88,7 +88,7 @@ def read_track(topic: TopicInfo, *, max_points: int = 5_000) -> Track | None:
     )
 
 
-def local_metres(track: Track) -> npt.NDArray[np.float64]:
+def local_meters(track: Track) -> npt.NDArray[np.float64]:
     """Return the positions as east and north in m, of shape (n, 2), relative to the first one of a GPS track."""
     if not track.is_gps or not len(track.positions):
         return track.positions[:, :2]

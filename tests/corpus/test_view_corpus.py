@@ -15,7 +15,7 @@ from mosaico_ingest.view.pictures import has_pictures, row_picture
 from mosaico_ingest.view.rows import first_rows, last_rows, nearest_row
 from mosaico_ingest.view.series import plot_fields, read_series
 from mosaico_ingest.view.statistics import describe_topic
-from mosaico_ingest.view.tracks import local_metres, read_track
+from mosaico_ingest.view.tracks import local_meters, read_track
 from mosaico_ingest.view.values import json_value, scalar_text
 
 
@@ -48,7 +48,7 @@ def test_all_topics_of_corpus_can_be_shown(corpus: Path, tmp_path: Path) -> None
         series = read_series(topic, plot_fields(topic), max_points=500)
         plots += bool(chart_lines(series, width=60, height=8)) if series else 0
         track = read_track(topic)
-        tracks += track is not None and len(local_metres(track)) > 0
+        tracks += track is not None and len(local_meters(track)) > 0
         row = nearest_row(topic)
         if has_pictures(topic) and row is not None:
             pixels = row_picture(topic, row, size=200)

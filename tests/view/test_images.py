@@ -209,7 +209,7 @@ def test_decode_image_compressed_depth_equals_raw_depth() -> None:
     assert np.array_equal(decoded, color_map(depth))
 
 
-def test_decode_image_inverse_depth_restores_metres() -> None:
+def test_decode_image_inverse_depth_restores_meters() -> None:
     depth = np.linspace(0.5, 8, HEIGHT * WIDTH).reshape(HEIGHT, WIDTH)
     first, second = 100.0 * 101.0, 1 - 101.0 * 100.0 / 10.0
     codes = np.rint(first / depth + second).astype(np.uint16)

@@ -12,7 +12,7 @@ import pytest
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.ontology.registry import builtin_type
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.view.tracks import has_track, local_metres, read_track
+from mosaico_ingest.view.tracks import has_track, local_meters, read_track
 
 FIX = OntologyType(
     "Unmodeled",
@@ -40,9 +40,9 @@ def test_read_track_of_quickstart_has_latitude_longitude_and_frame(quickstart: S
     assert track is not None
     assert (track.is_gps, track.rows, track.frame_id) == (True, 50, "gps")
     assert track.positions[0] == pytest.approx([45.46, 9.19, 122], abs=0.01)
-    metres = local_metres(track)
-    assert metres[0].tolist() == [0, 0]
-    assert 3 < np.ptp(metres[:, 0]) < 30
+    meters = local_meters(track)
+    assert meters[0].tolist() == [0, 0]
+    assert 3 < np.ptp(meters[:, 0]) < 30
 
 
 def test_read_track_omits_rows_without_fix(make_store: Any) -> None:
@@ -68,14 +68,14 @@ def test_read_track_of_planar_body_has_z_zero(make_store: Any) -> None:
     assert track is not None
     assert not track.is_gps
     assert track.positions.tolist() == [[1, 2, 0]]
-    assert local_metres(track).tolist() == [[1, 2]]
+    assert local_meters(track).tolist() == [[1, 2]]
 
 
-def test_local_metres_crosses_the_date_line(make_store: Any) -> None:
+def test_local_meters_crosses_the_date_line(make_store: Any) -> None:
     rows = [fix(0, 0, 179.999), fix(1, 0.001, -179.999)]
     track = read_track(make_store({"/t": (FIX, rows)}).topic("made", "t"))
     assert track is not None
-    assert local_metres(track)[1] == pytest.approx([222.39, 111.19], abs=0.1)
+    assert local_meters(track)[1] == pytest.approx([222.39, 111.19], abs=0.1)
 
 
 @pytest.mark.parametrize(
@@ -94,5 +94,5 @@ def test_read_track_of_topic_without_rows_or_positions(make_store: Any) -> None:
     track = read_track(store.topic("made", "gps"))
     assert track is not None
     assert track.positions.shape == (0, 3)
-    assert local_metres(track).shape == (0, 2)
+    assert local_meters(track).shape == (0, 2)
     assert read_track(store.topic("made", "imu")) is None
