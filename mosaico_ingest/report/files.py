@@ -6,7 +6,7 @@ a run continues the report of an interrupted one; a recording then has the line 
 
 from __future__ import annotations
 
-import os
+import sys
 from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
@@ -24,6 +24,9 @@ from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.report.contract import ReportPart
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
 from mosaico_ingest.report.model import Report, RunningSummary, RunReport, Summary, UsedManifest, summarize
+
+if sys.platform != "win32":
+    import fcntl
 
 LINES_SUFFIX = ".jsonl"
 """The suffix of report files in JSON Lines."""
@@ -166,7 +169,7 @@ class ReportWriter:
 
     Raises:
         ManifestError: The path has another suffix, or the file to continue is not a report.
-        SinkError: The file cannot be written.
+        SinkError: The file cannot be written, or another run is writing it.
     """
 
     def __init__(self, path: Path, header: Header, *, resume: bool = False) -> None:
@@ -179,13 +182,20 @@ class ReportWriter:
         self._finished: set[int] = set()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            if resume and path.is_file():
-                with path.open("rb") as file:
-                    self._finished = self._index.read(file).finished
-                os.truncate(path, self._index.end)  # removes a line that a killed run did not complete
-            self._file = path.open("ab" if resume else "wb")
+            self._file = path.open("ab")
         except OSError as error:
             raise self._unwritable(error) from error
+        try:
+            self._lock()
+            if resume:
+                with path.open("rb") as file:
+                    self._finished = self._index.read(file).finished
+            self._file.truncate(self._index.end)  # also removes a line that a killed run did not complete
+        except BaseException as error:
+            self._file.close()
+            if isinstance(error, OSError):
+                raise self._unwritable(error) from error
+            raise
         self._index.add_header(header)
         self._append(header)
 
@@ -223,6 +233,21 @@ class ReportWriter:
         self._append(Footer(summary=summary))
         self._index.summary = summary
         return self._index.report()
+
+    def _lock(self) -> None:
+        """Lock the file until it is closed or the process ends; Windows and some network drives have no such lock."""
+        if sys.platform == "win32":
+            return
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise SinkError(
+                "another run is writing the report",
+                where=str(self._index.path),
+                hint="name another file, or wait until the run ends",
+            ) from error
+        except OSError:
+            return
 
     def _append(self, part: ReportPart) -> None:
         line = part.model_dump_json().encode() + b"\n"

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import sys
 import time
 from pathlib import Path
 
@@ -88,6 +89,21 @@ def test_report_writer_resuming_keeps_finished_lines_and_replaces_others(tmp_pat
 def test_report_writer_without_resume_replaces_the_file(tmp_path: Path) -> None:
     write(tmp_path / "run.jsonl", recording(1))
     assert [one.sequence for one in write(tmp_path / "run.jsonl", recording(2)).recordings] == ["drive_002"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no such lock")
+@pytest.mark.parametrize("resume", [False, True])
+def test_report_writer_beside_another_one_is_refused(*, resume: bool, tmp_path: Path) -> None:
+    file = tmp_path / "run.jsonl"
+    with ReportWriter(file, HEADER) as writer:
+        writer.add(recording(1))
+        with pytest.raises(SinkError, match="another run") as caught:
+            ReportWriter(file, HEADER, resume=resume)
+        assert caught.value.where == str(file)
+        writer.add(recording(2))
+        writer.finish()
+    assert list(read_report(file).recordings) == [recording(1), recording(2)]
+    assert len(write(file, recording(3), resume=resume).recordings) == (3 if resume else 1)
 
 
 def test_combined_reports_have_the_recordings_and_sums_of_all(tmp_path: Path) -> None:
