@@ -48,8 +48,8 @@ class Processes(Struct, frozen=True):
 
     A worker receives several small recordings at a time, which it commits together; the number doubles from one group to
     the next, so that all workers end at about the same time. If a worker dies, its recordings are started again, each
-    alone and up to `attempts` times in total; other recordings are not affected. The memory budget of the jobs is split among the workers. Each worker calls `prepare` first, for example to configure
-    logging.
+    alone and up to `attempts` times in total; other recordings are not affected. The memory budget of the jobs is split
+    among the workers. Each worker calls `prepare` first, for example to configure logging.
     """
 
     processes: int

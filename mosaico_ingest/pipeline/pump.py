@@ -119,16 +119,13 @@ def write_sequence(
     return Written(session, topics, quarantine, request.if_exists, tuple(missing), failure)
 
 
-def verify(written: Written, commit_error: Exception | None, observe: Observer, *, interrupted: bool) -> None:
+def verify(written: Written, commit_error: Exception | None, observe: Observer) -> None:
     """Close every topic in the report and compare the destination with the rows that were written.
-
-    `interrupted` is true if a signal arrived during the commit, which was finished first.
 
     Raises:
         Exception: `commit_error`, or the earlier error after which a partial result should have been kept.
         IngestError: The error after which a partial result was kept.
         VerificationError: The destination does not have the rows that were written, or messages are missing.
-        Interrupted: A signal arrived during the commit.
     """
     if commit_error is not None:
         cause = written.failure or commit_error
@@ -167,8 +164,6 @@ def verify(written: Written, commit_error: Exception | None, observe: Observer, 
             "; ".join(problems),
             hint="the stored sequence is incomplete; replace it, and report this as a bug",
         )
-    if interrupted:
-        raise Interrupted("stopped after the recording was stored completely")
 
 
 def check_counts(

@@ -124,11 +124,22 @@ class _Run:
         self._events.stopwatch.pause()
 
     def finish(self, *, interrupted: bool) -> Outcome:
-        """Check what was committed, and return the outcome."""
+        """Check what was committed, and return the outcome.
+
+        `interrupted` is true if a signal arrived before or during the commit, which was finished first. The outcome is then
+        that of an interrupt even if there was an error, so that no other recording starts.
+        """
         self._events.stopwatch.resume(self.commit_s)
         if self.written is not None:
             with self._errors_reported(), log_level(self.task.job.run.log_level):
-                verify(self.written, self.commit_error, self._events, interrupted=interrupted)
+                try:
+                    verify(self.written, self.commit_error, self._events)
+                except Exception as error:
+                    if not interrupted or isinstance(error, Interrupted):
+                        raise
+                    raise Interrupted(f"stopped by a signal, after an error: {error}") from error
+                if interrupted:
+                    raise Interrupted("stopped after the recording was stored completely")
                 self._outcome = self._events.complete()
         assert self._outcome is not None  # noqa: S101 - both steps report every error
         return self._outcome

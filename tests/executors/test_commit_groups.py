@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import signal
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ import pytest
 
 from mosaico_ingest.destinations.store import Store, files, session
 from mosaico_ingest.destinations.store.catalog import Catalog
+from mosaico_ingest.errors import SinkError
 from mosaico_ingest.executors import groups
 from mosaico_ingest.executors.base import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
@@ -137,6 +139,20 @@ def test_group_whose_files_cannot_be_synced_fails(
     assert [report.exit_code for report in reports] == [1, 1]
     assert commits == []
     assert Store.open(tmp_path / "store").names() == ()
+
+
+def test_interrupt_during_a_commit_that_fails_starts_no_other_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def commit(_catalog: Catalog, _sessions: Sequence[Any]) -> list[str]:
+        signal.raise_signal(signal.SIGINT)
+        raise SinkError("the disk is full")
+
+    monkeypatch.setattr(Catalog, "commit", commit)
+    monkeypatch.setattr(groups, "SMALL_BYTES", 0)
+    (report,) = run([task(tmp_path, name) for name in "ab"])
+    assert (report.sequence, report.status, report.exit_code) == ("a", RunStatus.INTERRUPTED, 130)
+    assert "the disk is full" in str(report.error)
 
 
 def test_report_of_a_recording_follows_its_commit(tmp_path: Path, commits: list[list[str]]) -> None:
