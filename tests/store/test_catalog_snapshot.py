@@ -81,6 +81,18 @@ def test_filters_with_snapshot_equal_complete_entries(store: Store, objects: Obj
     assert read_documents(objects) in ([], ["s4.json"])
 
 
+def test_filtered_listing_reads_each_document_once(
+    objects: ObjectStore, tmp_path: Path, rows: Rows, sample: OntologyType
+) -> None:
+    few = Store.open(objects.url(f"filters/{tmp_path.name}"))
+    for name in NAMES[:2]:
+        write(few, name, rows([1, 2]), sample)
+    objects.counts()
+    assert [one.name for one in few.listing(metadata={"name": "s1"}).sequences] == ["s1"]
+    lines = [line for line in objects.counts().requests if line.startswith("GET") and ".json" in line]
+    assert len(lines) == len(NAMES[:2])
+
+
 def test_damaged_snapshot_is_replaced(store: Store, objects: ObjectStore, tmp_path: Path) -> None:
     before = store.listing().sequences
     snapshot_file(objects, tmp_path).write_bytes(b"PAR1 damaged")

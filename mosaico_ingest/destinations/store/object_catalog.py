@@ -224,8 +224,8 @@ class SequenceDocument(_Part):
             )
             for topic in self.topics
         )
-        kept = tuple(topic for topic in topics if topic.segments or topic.session != session)
-        return self.model_copy(update={"sessions": rest, "topics": kept})
+        remaining = tuple(topic for topic in topics if topic.segments or topic.session != session)
+        return self.model_copy(update={"sessions": rest, "topics": remaining})
 
     def _topic(self, topic: TopicEntry, root: RemotePath) -> TopicInfo:
         segments = sorted(topic.segments, key=lambda one: (one.start_ns, one.session, one.path))
@@ -426,13 +426,14 @@ class ObjectCatalog:
         names = [
             name for name in self.names() if selection.match is None or fnmatchcase(name, selection.match)
         ]
+        matches: dict[str, SequenceSummary] | None = None
         if selection.metadata or selection.incomplete:
-            known = {one.name: one for one in self._summaries(names)}
-            names = [name for name in names if name in known and selection.selects(known[name])]
+            matches = {one.name: one for one in self._summaries(names) if selection.selects(one)}
+            names = list(matches)
         rest = [name for name in names if after is None or name > after]
         page = rest[:limit]
-        summaries = tuple(self._summaries(page))
-        return Listing(summaries, len(names), page[-1] if page and len(page) < len(rest) else None)
+        summaries = self._summaries(page) if matches is None else [matches[name] for name in page]
+        return Listing(tuple(summaries), len(names), page[-1] if page and len(page) < len(rest) else None)
 
     def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
         """See `StoreCatalog.family_topics`."""
