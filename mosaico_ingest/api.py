@@ -330,18 +330,18 @@ def run(
         tasks = LazySequence.of(add_group_results(tasks))
     from mosaico_ingest.pipeline.known import mark_known
 
-    chosen = executor or choose_executor(tasks)
+    executor = executor or choose_executor(tasks)
     tool = f"mosaico-ingest {__version__}"
     if report is None:
-        recordings = tuple(chosen.map(tasks if verify else mark_known(tasks), observe))
+        recordings = tuple(executor.map(tasks if verify else mark_known(tasks), observe))
         return RunReport(tool=tool, manifests=tuple(manifests), recordings=recordings)
     from mosaico_ingest.report.files import Header, ReportWriter
 
     with ReportWriter(report, Header(tool=tool, manifests=tuple(manifests)), resume=resume) as writer:
         if resume:
             tasks = tasks.map(_skipping_task)
-        marked = tasks if verify else mark_known(tasks, writer.has_finished)
-        for recording in chosen.map(marked, observe):
+        candidates = tasks if verify else mark_known(tasks, writer.has_finished)
+        for recording in executor.map(candidates, observe):
             writer.add(recording)
         return writer.finish()
 

@@ -140,9 +140,9 @@ class ConditionFilter:
                 keep = keep & ~values.null
         changed = keep.copy()
         if conditions.on_change and keep.any():
-            kept = rows if keep.all() else rows.filter(pa.array(keep))
-            evaluator = Evaluator(kept, envelope.take(keep))
-            changed[keep] = self._changes(conditions.on_change, evaluator, len(kept))
+            matches = rows if keep.all() else rows.filter(pa.array(keep))
+            evaluator = Evaluator(matches, envelope.take(keep))
+            changed[keep] = self._changes(conditions.on_change, evaluator, len(matches))
         return keep, changed
 
     def _changes(self, expressions: Sequence[FieldExpression], evaluator: Evaluator, count: int) -> Mask:

@@ -41,9 +41,9 @@ def mark_known(
 
     for batch in _batches(tasks):
         skippable = [may_be_skipped(task) for task in batch]
-        known = iter(known_recordings([task.job for task in compress(batch, skippable)]))
+        is_known = iter(known_recordings([task.job for task in compress(batch, skippable)]))
         for task, is_skippable in zip(batch, skippable, strict=True):
-            yield structs.replace(task, known=True) if is_skippable and next(known) else task
+            yield structs.replace(task, known=True) if is_skippable and next(is_known) else task
 
 
 def with_known(jobs: Iterable[Job]) -> Iterator[tuple[Job, bool]]:
@@ -61,15 +61,15 @@ def known_recordings(jobs: Sequence[Job]) -> list[bool]:
     for position, job in enumerate(jobs):
         # Targets are not hashable, and the jobs of a manifest share one.
         positions[id(job.target), job.folder].append(position)
-    known = [False] * len(jobs)
+    are_known = [False] * len(jobs)
     for group in positions.values():
         stored = _stored([jobs[position] for position in group])
         for position in group:
             existing = stored.get(jobs[position].sequence.name)
             if existing is not None and existing.complete:
                 prints = {record.fingerprint for record in StoredProvenance.of(existing).records} - {None}
-                known[position] = bool(prints) and fingerprint(jobs[position]) in prints
-    return known
+                are_known[position] = bool(prints) and fingerprint(jobs[position]) in prints
+    return are_known
 
 
 def _stored(jobs: Sequence[Job]) -> dict[str, ExistingSequence]:

@@ -275,8 +275,8 @@ def _is_latched(job: Job, connection: Connection) -> bool:
     time = job.bag.time
     if (time.start is None and job.part is None) or not time.include_latched:
         return False
-    listed = first_match(time.latched, connection.topic) is not None
-    return listed or connection.latched or is_static(connection.topic)
+    matches_glob = first_match(time.latched, connection.topic) is not None
+    return matches_glob or connection.latched or is_static(connection.topic)
 
 
 def _describe_definition(definition: Definition) -> str:

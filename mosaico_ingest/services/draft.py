@@ -128,7 +128,9 @@ def _adapters(inspection: Inspection) -> Iterator[str]:
     example = (
         unmodeled[0].topic if unmodeled else inspection.topics[0].topic if inspection.topics else "/topic"
     )
-    offers = [(topic, known) for topic in unmodeled for known in BUILTIN if topic.msgtype in known.ros_types]
+    offers = [
+        (topic, adapter) for topic in unmodeled for adapter in BUILTIN if topic.msgtype in adapter.ros_types
+    ]
     for topic, adapter in offers:
         yield f"  # {adapter.name} accepts {topic.msgtype} only if an override selects it, and stores {adapter.tag}:"
         yield f"  # override: {{{plain(topic.topic)}: {adapter.name}}}"

@@ -146,8 +146,8 @@ class Window(Struct, frozen=True):
 
 def scan(segments: Sequence[SegmentInfo], schema: pa.Schema, window: Window) -> Iterator[pa.RecordBatch]:
     """Yield the rows of the columns in `schema`, sorted by `timestamp_ns`, its first column."""
-    wanted = [segment for segment in segments if window.overlaps(segment.start_ns, segment.end_ns)]
-    for together in _overlapping(wanted):
+    in_window = [segment for segment in segments if window.overlaps(segment.start_ns, segment.end_ns)]
+    for together in _overlapping(in_window):
         streams = [_read(segment, schema, window) for segment in together]
         yield from streams[0] if len(streams) == 1 else _merge(streams, schema)
 
@@ -432,5 +432,5 @@ def _chosen(schema: pa.Schema, columns: Sequence[str], *, where: str) -> pa.Sche
         raise SinkError(
             f"there is no column {unknown[0]!r}", where=where, hint=suggest_names(schema.names, unknown[:1])
         )
-    wanted = dict.fromkeys([schema.names[0], *columns])
-    return pa.schema([schema.field(name) for name in wanted])
+    names = dict.fromkeys([schema.names[0], *columns])
+    return pa.schema([schema.field(name) for name in names])
