@@ -374,11 +374,11 @@ def run_tasks(
         batch = batch.map(methodcaller("with_log_level", level))
     interrupt_on_sigterm()
     collect_garbage_as_usual()
-    report_files = {
-        path for path in (report, *(_report_path(task.job) for task in batch.samples)) if path is not None
-    }
-    for file in report_files - {STANDARD_OUTPUT}:
-        check_output_file(file)
+    paths = (report, *(_report_path(task.job) for task in batch.samples))
+    report_files = list(dict.fromkeys(path for path in paths if path is not None))
+    for file in report_files:
+        if file != STANDARD_OUTPUT:
+            check_output_file(file)
     errors = _Errors()
 
     def observe_all(position: int, event: Event) -> None:
@@ -397,7 +397,9 @@ def run_tasks(
                 report=stream,
                 resume=resume,
             )
-        write_errors = list(_write_results(result, report_files - {stream}, on_finish))
+        write_errors = list(
+            _write_results(result, [file for file in report_files if file != stream], on_finish)
+        )
         if not quiet and not as_json:
             from mosaico_ingest.cli.report import print_report
 
@@ -441,21 +443,23 @@ class _Errors:
 
 
 @contextmanager
-def _streamed_report(files: set[Path], recordings: int, *, resume: bool) -> Generator[Path | None]:
-    """Yield the file to which each recording is appended when it ends: a report file, or a temporary one for many recordings.
+def _streamed_report(files: Sequence[Path], recordings: int, *, resume: bool) -> Generator[Path | None]:
+    """Yield the file to which each recording is appended when it ends.
+
+    It is the first report file in JSON Lines; without one, a temporary file if there are many recordings.
 
     Raises:
         typer.BadParameter: The report of an earlier run cannot be continued, because no report file is in JSON Lines.
     """
     from mosaico_ingest.report.files import LINES_SUFFIX
 
-    streamed = next((file for file in sorted(files) if file.suffix == LINES_SUFFIX), None)
-    if resume and streamed is None:
+    report_file = next((file for file in files if file.suffix == LINES_SUFFIX), None)
+    if resume and report_file is None:
         raise typer.BadParameter(
             f"needs a report in JSON Lines: --report FILE{LINES_SUFFIX}", param_hint="--resume"
         )
-    if streamed is not None or recordings <= MAX_REPORTS:
-        yield streamed
+    if report_file is not None or recordings <= MAX_REPORTS:
+        yield report_file
         return
     with TemporaryDirectory(prefix="ingest-report-") as folder:
         yield Path(folder) / f"report{LINES_SUFFIX}"
@@ -474,7 +478,7 @@ def _display(
 
 
 def _write_results(
-    result: RunReport, report_files: set[Path], on_finish: Callable[[RunReport], None]
+    result: RunReport, report_files: Sequence[Path], on_finish: Callable[[RunReport], None]
 ) -> Iterator[SinkError]:
     """Call `on_finish` and write the report files; yield the errors."""
     from mosaico_ingest.report.files import report_text
