@@ -340,7 +340,7 @@ def run(
     with ReportWriter(report, Header(tool=tool, manifests=tuple(manifests)), resume=resume) as writer:
         if resume:
             tasks = tasks.map(_skipping_task)
-        candidates = tasks if verify else mark_known(tasks, writer.has_finished)
+        candidates = tasks if verify else mark_known(tasks, writer.has_finished if resume else None)
         for recording in executor.map(candidates, observe):
             writer.add(recording)
         return writer.finish()

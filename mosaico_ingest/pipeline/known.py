@@ -24,18 +24,22 @@ _T = TypeVar("_T")
 
 
 def mark_known(
-    tasks: Iterable[Task], is_finished: Callable[[str, str], bool] = lambda _sequence, _destination: False
+    tasks: Iterable[Task], is_finished: Callable[[str, str], bool] | None = None
 ) -> Iterator[Task]:
     """Yield the tasks, and mark a task as known if its recording is stored, complete and unchanged and may be skipped.
 
-    It may be skipped with `if_exists: skip`, or if `is_finished` returns True for its sequence and destination.
+    It may be skipped with `if_exists: skip`. In a run that continues another one, `is_finished` returns whether that run
+    reported a sequence and destination as stored. A recording may then also be skipped if it was, and with
+    `if_exists: append`: the run may have been killed before it reported the rows, which would be stored twice.
     """
 
     def may_be_skipped(task: Task) -> bool:
         job = task.job
         if task.plan_digest is not None or task.dry_run:
             return False
-        return job.sequence.if_exists is IfExists.SKIP or is_finished(
+        if job.sequence.if_exists is IfExists.SKIP or is_finished is None:
+            return job.sequence.if_exists is IfExists.SKIP
+        return job.sequence.if_exists is IfExists.APPEND or is_finished(
             job.sequence.name, destination_of(job.destination).describe()
         )
 

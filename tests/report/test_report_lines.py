@@ -13,6 +13,7 @@ from typer.testing import CliRunner, Result
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import command_line
+from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.files import Header, ReportWriter, combine, read_report, report_text
@@ -170,6 +171,27 @@ def test_resume_skips_finished_recordings_that_a_job_would_replace(job: Path) ->
     after = api.run(job, report=file, resume=True)
     assert tuple(after.recordings) == tuple(before.recordings)
     assert after.summary == before.summary.replace(resumed=3)
+
+
+def test_resume_appends_no_recording_twice_whose_line_is_missing(job: Path) -> None:
+    job.write_text(job.read_text().replace('"{stem}"', '"{stem}", if_exists: append'))
+    file = job.parent / "run.jsonl"
+    api.run(job, report=file)
+    header, first, *_ = file.read_text().splitlines(keepends=True)
+    file.write_text(header + first)  # killed between a commit and its line
+    report = api.run(job, report=file, resume=True)
+    assert [one.status for one in report.recordings] == [RunStatus.COMPLETED, *[RunStatus.SKIPPED] * 2]
+    assert [info.rows for info in Store.open(job.parent / "store").sequences()] == [1000] * 3
+
+
+def test_resume_continues_the_report_of_the_command_line(job: Path) -> None:
+    other, file = job.parent / "a.jsonl", job.parent / "b.jsonl"
+    job.write_text(f"{job.read_text()}run: {{report: {other}}}\n")
+    api.run(job, report=file)
+    write(other, recording(1))
+    assert ingest("run", job, "--report", file, "--resume", "--quiet").exit_code == 0
+    assert [one.sequence for one in read_report(other).recordings] == ["a", "b", "c"]
+    assert read_report(file).summary.resumed == 3
 
 
 def test_resume_without_lines_is_refused(job: Path) -> None:
