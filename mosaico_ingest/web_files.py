@@ -259,7 +259,10 @@ class _WebFile(RangedFile):
         if self._complete is None:
             self._complete, self._received = self._files.request(self._path, 0, end), 0
         while self._received < start:
-            self._received += len(self._files.read(*self._complete, min(start - self._received, _SKIP_BYTES)))
+            data = self._files.read(*self._complete, min(start - self._received, _SKIP_BYTES))
+            if not data:  # the file has become shorter
+                return b""
+            self._received += len(data)
         data = self._files.read(*self._complete, end - start)
         self._received += len(data)
         return data

@@ -137,6 +137,15 @@ def test_read_retries_server_errors(server: WebServer) -> None:
     assert remote(server, "a.mcap").read_bytes() == b"content"
 
 
+def test_read_at_behind_the_end_of_a_truncated_file_returns_nothing(server: WebServer) -> None:
+    server.files["a.mcap"] = bytes(200)
+    server.ranges = False
+    path = remote(server, "a.mcap")
+    with path.filesystem.open_input_file(path.filesystem_path) as file:
+        server.files["a.mcap"] = bytes(50)
+        assert path.range_reader(file)(100, 150) == b""
+
+
 @pytest.mark.parametrize("ranges", [True, False])
 def test_read_at_returns_the_range(server: WebServer, *, ranges: bool) -> None:
     server.files["a.mcap"] = bytes(range(200))
