@@ -409,9 +409,8 @@ class ROSBridge:
 
 def _layout(value: object) -> SerializationFormat:
     try:
-        return SerializationFormat(
-            value.value if isinstance(value, Enum) else value
-        )  # the SDK has its own enum
+        # The SDK has its own enumeration.
+        return SerializationFormat(value.value if isinstance(value, Enum) else value)
     except ValueError:
         allowed = ", ".join(layout.value for layout in SerializationFormat)
         raise AdapterError(

@@ -241,9 +241,8 @@ def _mirrored_fields(
 ) -> list[_Columns]:
     columns: list[_Columns] = []
     for field in definition.types[msgtype].fields:
-        name = (
-            f"{field.name}_" if top and field.name == "timestamp_ns" else field.name
-        )  # the envelope's column
+        # The envelope has the column `timestamp_ns`.
+        name = f"{field.name}_" if top and field.name == "timestamp_ns" else field.name
         type_ = shape.field(shape.get_field_index(field.name)).type
         columns.append(_mirrored_field(definition, field, name, type_, margin))
     return columns

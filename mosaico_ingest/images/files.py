@@ -48,9 +48,8 @@ def file_samples(data: bytes, *, keep_alpha: bool = False) -> npt.NDArray[Any]:
     try:
         if picture.mode in {"L", "F", "I"} or picture.mode.startswith("I;16"):
             samples = np.asarray(picture)
-            is_16_bit = (
-                picture.mode != "I" or picture.format == "PNG"
-            )  # versions of Pillow differ in the mode
+            # Some versions of Pillow open PNG files of 16 bits in the mode "I".
+            is_16_bit = picture.mode != "I" or picture.format == "PNG"
             return samples.astype(np.uint16) if picture.mode.startswith("I") and is_16_bit else samples
         has_alpha = keep_alpha and picture.mode == "RGBA"
         return np.asarray(picture if has_alpha else picture.convert("RGB"))

@@ -64,9 +64,8 @@ class Telemetry:
 
     def __init__(self, *, metrics: bool = True, traces: bool = True) -> None:
         resource = Resource.create({"service.name": _SERVICE, "service.version": __version__})
-        resource = resource.merge(
-            OTELResourceDetector().detect()
-        )  # attributes from the environment take precedence
+        # Attributes from the environment take precedence.
+        resource = resource.merge(OTELResourceDetector().detect())
         readers = [PeriodicExportingMetricReader(OTLPMetricExporter())] if metrics else []
         self._meters = MeterProvider(readers, resource)
         self._tracers = TracerProvider(resource=resource)

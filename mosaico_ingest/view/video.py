@@ -128,9 +128,8 @@ def _packets(av: ModuleType, topic: TopicInfo, start_ns: int, end_ns: int) -> It
 
 def _decoder(av: ModuleType, codec: str) -> Any:  # noqa: ANN401 - a class of an optional library
     decoder = av.CodecContext.create(_DECODERS.get(codec, codec), "r")
-    decoder.thread_count = (
-        1  # threads of libdav1d release packets with the GIL, for which PyAV deadlocks when it closes
-    )
+    # Threads of libdav1d need the GIL to release packets, so PyAV deadlocks when it closes a decoder with threads.
+    decoder.thread_count = 1
     return decoder
 
 
