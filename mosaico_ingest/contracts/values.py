@@ -126,21 +126,21 @@ class LatencyRange:
             self.unset += int(unset.sum())
             bad |= unset
             excess = np.where(unset, 0.0, excess)
-            known = np.flatnonzero(~unset)
+            positions = np.flatnonzero(~unset)
         else:
-            known = None
+            positions = None
         self.violations.add(batch, Values(latency, unset if unset.any() else None, None), bad, excess)
-        self._note_extremes(batch, latency, known)
+        self._note_extremes(batch, latency, positions)
 
     def _note_extremes(
-        self, batch: Batch, latency: NDArray[np.int64], known: NDArray[np.int64] | None
+        self, batch: Batch, latency: NDArray[np.int64], positions: NDArray[np.int64] | None
     ) -> None:
-        if known is not None and not len(known):
+        if positions is not None and not len(positions):
             return
-        candidates = latency if known is None else latency[known]
+        candidates = latency if positions is None else latency[positions]
         low, high = int(candidates.argmin()), int(candidates.argmax())
-        if known is not None:
-            low, high = int(known[low]), int(known[high])
+        if positions is not None:
+            low, high = int(positions[low]), int(positions[high])
         if self.lowest is None or latency[low] < self.lowest.value:
             self.lowest = batch.violation(low, latency[low])
         if self.highest is None or latency[high] > self.highest.value:
@@ -217,12 +217,12 @@ class NumberLimits:
         if not len(data):
             return
         self.count += len(data)
-        known = data if values.null is None else data[~values.null]
-        if not len(known):
+        numbers = data if values.null is None else data[~values.null]
+        if not len(numbers):
             return
-        low, high = known.min(), known.max()
+        low, high = numbers.min(), numbers.max()
         if np.isnan(low):
-            finite = known[~np.isnan(known)]
+            finite = numbers[~np.isnan(numbers)]
             if len(finite):
                 self._widen(finite.min(), finite.max())
         else:
@@ -351,11 +351,11 @@ class Changes:
         with np.errstate(invalid="ignore"):
             changes = np.abs(np.diff(data, prepend=self._previous))
         self._previous = float(data[-1])
-        known = changes[np.isfinite(changes)]
-        if not len(known):
+        finite_changes = changes[np.isfinite(changes)]
+        if not len(finite_changes):
             return
-        self.count += len(known)
-        low, high = float(known.min()), float(known.max())
+        self.count += len(finite_changes)
+        low, high = float(finite_changes.min()), float(finite_changes.max())
         self.lowest = low if self.lowest is None else min(self.lowest, low)
         self.highest = high if self.highest is None else max(self.highest, high)
         if low < self.low or high > self.high:

@@ -24,7 +24,7 @@ def listed_counts(files: RecordingFiles) -> dict[str, int]:
 
 def add_missing_messages(
     connections: Sequence[Connection],
-    listed: Mapping[str, int],
+    listed_counts: Mapping[str, int],
     unreadable: Iterable[UnreadableRange],
     *,
     file: str,
@@ -40,7 +40,7 @@ def add_missing_messages(
     of_topic: dict[str, list[Connection]] = defaultdict(list)
     for connection in connections:
         of_topic[connection.topic].append(connection)
-    for topic, count in listed.items():
+    for topic, count in listed_counts.items():
         counts = [connection.count for connection in of_topic[topic]]
         difference = count - sum(number or 0 for number in counts)
         if None in counts or difference <= explained:
@@ -56,13 +56,13 @@ def add_missing_messages(
 
 def missing_after_reading(
     connections: Sequence[Connection],
-    listed: Mapping[str, int],
-    read: Mapping[int, int],
+    listed_counts: Mapping[str, int],
+    read_counts: Mapping[int, int],
     unreadable: Iterable[UnreadableRange],
     *,
     file: str,
 ) -> list[UnreadableRange]:
-    """Return the messages that are listed but were not read, for topics without an index; `read` is by connection.
+    """Return the messages that are listed but were not read, for topics without an index; `read_counts` is by connection.
 
     Unreadable ranges of unknown size or topic already explain any difference.
     """
@@ -73,21 +73,23 @@ def missing_after_reading(
         if item.connection is not None:
             unreadable_counts[item.connection] += item.count
     missing: list[UnreadableRange] = []
-    for topic, count in listed.items():
+    for topic, count in listed_counts.items():
         matching = [connection for connection in connections if connection.topic == topic]
         if not any(connection.count is None for connection in matching):
             continue
-        difference = count - sum(read.get(each.id, 0) + unreadable_counts[each.id] for each in matching)
-        if difference > 0 and all(each.id in read for each in matching):
+        difference = count - sum(
+            read_counts.get(each.id, 0) + unreadable_counts[each.id] for each in matching
+        )
+        if difference > 0 and all(each.id in read_counts for each in matching):
             missing.append(_missing(topic, count, difference, matching[0], file))
     return missing
 
 
 def _missing(
-    topic: str, listed: int, difference: int, connection: Connection | None, file: str
+    topic: str, count: int, difference: int, connection: Connection | None, file: str
 ) -> UnreadableRange:
     reason = (
-        f"the metadata lists {listed} messages of {topic}, and {difference} of them are not in the recording"
+        f"the metadata lists {count} messages of {topic}, and {difference} of them are not in the recording"
     )
     return UnreadableRange(
         0, reason, connection=None if connection is None else connection.id, count=difference, file=file
