@@ -6,13 +6,14 @@ a run continues the report of an interrupted one; a recording then has the line 
 
 from __future__ import annotations
 
-import sys
 from array import array
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
+from importlib import import_module
+from importlib.util import find_spec
 from pathlib import Path
 from textwrap import indent
-from typing import IO, Literal, TypeVar
+from typing import IO, Any, Literal, TypeVar
 
 import msgspec
 from pydantic import BaseModel, ValidationError
@@ -25,9 +26,8 @@ from mosaico_ingest.report.contract import ReportPart
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
 from mosaico_ingest.report.model import Report, RunningSummary, RunReport, Summary, UsedManifest, summarize
 
-if sys.platform != "win32":
-    import fcntl
-
+_fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
+"""File locks; None on Windows."""
 LINES_SUFFIX = ".jsonl"
 """The suffix of report files in JSON Lines."""
 _HINT = "write one with `ingest run --report FILE`"
@@ -236,10 +236,10 @@ class ReportWriter:
 
     def _lock(self) -> None:
         """Lock the file until it is closed or the process ends; Windows and some network drives have no such lock."""
-        if sys.platform == "win32":
+        if _fcntl is None:
             return
         try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            _fcntl.flock(self._file, _fcntl.LOCK_EX | _fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise SinkError(
                 "another run is writing the report",
