@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import re
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from email.utils import formatdate
 from hashlib import sha256
-from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from http.server import BaseHTTPRequestHandler
 from typing import Any
 from urllib.parse import parse_qs, unquote, urlsplit
 from xml.sax.saxutils import escape
+
+from web_server import serving
 
 ACCOUNT = "account"
 CONTAINER = "container"
@@ -147,15 +148,5 @@ def tag(content: bytes) -> str:
 @contextmanager
 def blob_service() -> Iterator[BlobService]:
     """Run a service in a thread."""
-    state = BlobService()
-    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"state": state}))
-    server.daemon_threads = True
-    state.port = server.server_port
-    thread = threading.Thread(target=server.serve_forever, args=(0.01,))
-    thread.start()
-    try:
+    with serving(_Handler, BlobService()) as state:
         yield state
-    finally:
-        server.shutdown()
-        thread.join()
-        server.server_close()

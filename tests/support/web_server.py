@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from typing import Any
+from typing import Any, Protocol, TypeVar
 
 
 @dataclass
@@ -89,8 +89,21 @@ class _Handler(BaseHTTPRequestHandler):
 @contextmanager
 def web_server() -> Iterator[WebServer]:
     """Run a server in a thread."""
-    state = WebServer()
-    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (_Handler,), {"state": state}))
+    with serving(_Handler, WebServer()) as state:
+        yield state
+
+
+class _State(Protocol):
+    port: int
+
+
+State = TypeVar("State", bound=_State)
+
+
+@contextmanager
+def serving(handler: type[BaseHTTPRequestHandler], state: State) -> Iterator[State]:
+    """Answer requests in a thread; the handler has the state as an attribute, and the state knows the port."""
+    server = ThreadingHTTPServer(("127.0.0.1", 0), type("Handler", (handler,), {"state": state}))
     server.daemon_threads = True
     state.port = server.server_port
     thread = threading.Thread(target=server.serve_forever, args=(0.01,))
