@@ -13,13 +13,14 @@ from collections.abc import Generator, Mapping
 from contextlib import contextmanager
 from datetime import timedelta
 from io import RawIOBase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import obstore
 import pyarrow as pa
 from obstore import exceptions
 from obstore.store import AzureStore
 from pyarrow.fs import FileInfo, FileSelector, FileSystemHandler, FileType
+from typing_extensions import Buffer
 
 from mosaico_ingest.errors import IngestError, Unreachable
 from mosaico_ingest.web_files import Properties, RangedFile
@@ -146,7 +147,7 @@ class AzureFiles(FileSystemHandler):
         with _translated_errors(path):
             obstore.delete(self._store, _blob(path))
 
-    def _refuse(self, *_: object) -> Any:  # noqa: ANN401 - it never returns
+    def _refuse(self, *_: object) -> NoReturn:
         raise NotImplementedError
 
     _unused: Any = _refuse  # the overridden methods have different signatures
@@ -177,7 +178,7 @@ class _Output(RawIOBase):
     def writable(self) -> bool:
         return True
 
-    def write(self, data: Any) -> int:  # noqa: ANN401 - any buffer
+    def write(self, data: Buffer) -> int:
         with _translated_errors(self._path):
             return self._writer.write(bytes(data))
 

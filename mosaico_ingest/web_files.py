@@ -11,7 +11,7 @@ import os
 import time
 from email.utils import parsedate_to_datetime
 from io import RawIOBase
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 import pyarrow as pa
 import urllib3
@@ -175,7 +175,7 @@ class WebFiles(FileSystemHandler):
         """Open a file for sequential reading."""
         return self.open_input_file(path)
 
-    def _refuse(self, *_: object) -> Any:  # noqa: ANN401 - it never returns
+    def _refuse(self, *_: object) -> NoReturn:
         raise IngestError(
             "a web server cannot be written", where=self._root, hint="use a folder, s3://, gs:// or az://"
         )

@@ -15,6 +15,7 @@ from mosaico_ingest.findings import RowFailure
 
 if TYPE_CHECKING:
     from mosaico_ingest.adapters.adapter import Envelope
+    from mosaico_ingest.adapters.mapping.columns import DataType
 
 _FIELDS = 40
 """Maximum number of fields in a reason."""
@@ -83,7 +84,7 @@ def _field_names(shape: pa.DataType) -> str:
     return ", ".join(names[:_FIELDS]) + more if names else "none"
 
 
-def _paths(shape: Any, prefix: str) -> Iterator[str]:  # noqa: ANN401 - the stubs of nested types are incomplete
+def _paths(shape: DataType, prefix: str) -> Iterator[str]:
     for field in shape:
         path, type_ = f"{prefix}{field.name}", field.type
         while pt.is_list(type_) or pt.is_large_list(type_) or pt.is_fixed_size_list(type_):

@@ -7,12 +7,14 @@ import sys
 from collections.abc import Iterator
 from enum import Enum
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 from typer.main import get_command
 
 from mosaico_ingest.cli.app import command_line
 
+_Click: TypeAlias = Any
+"""A command or a parameter: a class of typer or of click, which depends on the version of typer."""
 _HEAD = """<!-- generated from the command line: ./dev docs -->
 
 # Command line
@@ -27,12 +29,12 @@ have [their own page](exit-codes.md).
 
 def cli_reference() -> str:
     """Return docs/cli.md, with a section for each command."""
-    root: Any = get_command(command_line())  # a class of typer or click, by version
+    root: _Click = get_command(command_line())
     sections = [_section(path, command) for path, command in _commands(root, "ingest")]
     return f"{_HEAD}\n{''.join(sections)}"
 
 
-def _commands(group: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN401 - a class of typer or click, by version
+def _commands(group: _Click, path: str) -> Iterator[tuple[str, _Click]]:
     """Yield the path and the object of each command, without groups."""
     for name, command in group.commands.items():
         if command.hidden:
@@ -43,7 +45,7 @@ def _commands(group: Any, path: str) -> Iterator[tuple[str, Any]]:  # noqa: ANN4
             yield f"{path} {name}", command
 
 
-def _section(path: str, command: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _section(path: str, command: _Click) -> str:
     parameters = [
         each for each in command.params if not getattr(each, "hidden", False) and each.name != "help"
     ]
@@ -70,19 +72,19 @@ def _paragraphs(text: str) -> str:
     return "\n\n".join(" ".join(part.split()) for part in re.split(r"\n\s*\n", text.replace("\b", "")))
 
 
-def _usage(argument: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _usage(argument: _Click) -> str:
     name = _metavar(argument)
     several = "…" if argument.nargs == -1 else ""
     return f"{name}{several}" if argument.required else f"[{name}{several}]"
 
 
-def _metavar(parameter: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _metavar(parameter: _Click) -> str:
     """Return the name of a value, without the brackets that mark optional arguments."""
     name = str(parameter.metavar or parameter.name.upper())
     return name[1:-1] if name.startswith("[") and name.endswith("]") else name
 
 
-def _names(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _names(option: _Click) -> str:
     """Return the names of an option with its value, such as `-n`, `--count N`."""
     *others, long = sorted(option.opts, key=len)
     value = "" if option.is_flag else f" {option.metavar or _choices(option) or 'VALUE'}"
@@ -90,7 +92,7 @@ def _names(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by 
     return ", ".join([*(f"`{name}`" for name in others), f"`{long}{value}`", *negative])
 
 
-def _choices(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _choices(option: _Click) -> str:
     """Return the words that an option accepts. The attribute with its type, and the class of the type, depend on the version of typer."""
     descriptor = getattr(option, "type_descriptor", None)
     kind: Any = descriptor.annotation if descriptor is not None else option.type
@@ -98,7 +100,7 @@ def _choices(option: Any) -> str:  # noqa: ANN401 - a class of typer or click, b
     return "|".join(str(getattr(word, "value", word)) for word in words)
 
 
-def _meaning(parameter: Any) -> str:  # noqa: ANN401 - a class of typer or click, by version
+def _meaning(parameter: _Click) -> str:
     """Return the help with the default and the environment variable."""
     text = " ".join((parameter.help or "").split())
     default, show_default = parameter.default, getattr(parameter, "show_default", True)

@@ -137,7 +137,7 @@ def run(
         bool,
         typer.Option(
             "--resume",
-            help="Continue the report of an interrupted run (FILE.jsonl): skip what it finished, and try the rest again.",
+            help="Continue the report of an interrupted run (FILE.jsonl): skip its stored recordings, and run the others.",
         ),
     ] = False,
     metrics: Annotated[

@@ -176,7 +176,7 @@ class _Pool:
                 self.batch.tell(position, content)
 
     def _separate(self, group: Sequence[int], error: IngestError) -> None:
-        """Send the recordings of a group that cannot be pickled one by one, to find the one that has the error."""
+        """Send the recordings of a group one by one, because the group cannot be pickled; a single recording fails."""
         if len(group) == 1:
             self.batch.fail(group[0], error)
         else:

@@ -87,9 +87,9 @@ def violations(
 
 
 def with_required_types(schema: MetadataSchema, texts: Mapping[str, str]) -> dict[str, Any]:
-    """Return texts, with a number, boolean or null for each one that violates the schema only because it is a text.
+    """Return texts with the types that the schema requires.
 
-    The value is that of the text as an unquoted YAML value.
+    A text that the schema rejects becomes its value in YAML without quotes, if the schema accepts this value.
     """
 
     def wrong_keys(values: Mapping[str, Any]) -> set[str]:

@@ -124,7 +124,7 @@ class _Run:
         self._events.stopwatch.pause()
 
     def finish(self, *, interrupted: bool) -> Outcome:
-        """Check what was committed, and return the outcome.
+        """Check the committed rows, and return the outcome.
 
         `interrupted` is true if a signal arrived before or during the commit, which was finished first. The outcome is then
         that of an interrupt even if there was an error, so that no other recording starts.

@@ -76,7 +76,7 @@ class _Index:
         self._offsets, self._keys, self._codes = array("q"), array("q"), array("q")
 
     def read(self, file: IO[bytes]) -> Self:
-        """Add the lines of a file, except a last one that is incomplete.
+        """Add the lines of a file; an incomplete last line is ignored.
 
         Raises:
             ManifestError: The file is not a report in JSON Lines.
@@ -133,7 +133,7 @@ class _Index:
         return report if self.summary is None else report.with_summary(self.summary)
 
     def _latest(self) -> Sequence[int]:
-        """Return the positions of recordings without those that a later run reported again."""
+        """Return the positions of the lines that no later run replaced."""
         if len(self._runs) <= 1:
             return range(len(self._offsets))
         later: set[int] = set()

@@ -55,6 +55,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
 )
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
+from mosaico_ingest.adapters.mapping.parser import LiteralValue
 from mosaico_ingest.adapters.mapping.types import is_number
 
 
@@ -380,7 +381,7 @@ def _is_presence(condition: TypedExpression) -> bool:
             return False
 
 
-def _null_if(values: Array, value: Any) -> Array:  # noqa: ANN401 - a literal
+def _null_if(values: Array, value: LiteralValue) -> Array:
     """Return the values with null in place of one value, which can be NaN."""
     is_nan = isinstance(value, float) and math.isnan(value)
     where = pc.is_nan(values) if is_nan else pc.equal(values, value)

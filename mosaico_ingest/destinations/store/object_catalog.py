@@ -610,7 +610,7 @@ class ObjectCatalog:
         ]
 
     def _contents(self, paths: Sequence[RemotePath]) -> list[Content | None]:
-        """Return the content of rows of the snapshot for documents; None for those that no longer exist."""
+        """Return the snapshot row of each document, None if the document no longer exists."""
         return [
             None
             if document is None
