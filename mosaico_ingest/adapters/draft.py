@@ -327,9 +327,8 @@ def draft(
     is_ros = definition.language is Language.ROS
     if embed and is_ros:
         parts.append("definition: |\n" + indent(definition.text.rstrip("\n"), "  ", lambda _: True))
-    if (
-        is_ros or example is not None
-    ):  # a file can only contain `.msg` texts, without which `given: {}` has no type
+    # A file can only contain `.msg` texts, without which `given: {}` has no type.
+    if is_ros or example is not None:
         parts.append("tests:\n" + "\n".join(_test(spec, adapter, definition, example)))
     return "\n\n".join(parts) + "\n"
 

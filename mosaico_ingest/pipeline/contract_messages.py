@@ -52,9 +52,8 @@ def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
     topics = tuple(key for topic in plan.read_topics for key in topic.connections)
     observed = [key for key in topics if monitor.observer(key) is not None]
     times = None
-    if not any(
-        isinstance(path, RemotePath) for path in recording.files
-    ):  # a request per chunk would take long
+    is_remote = any(isinstance(path, RemotePath) for path in recording.files)
+    if not is_remote:  # the times of a remote file cost a request per chunk
         times = recording.index_times(observed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
     if times is None:
         monitor = monitor_of(plan.replace(topics=()), recording)

@@ -100,9 +100,8 @@ class Compiler:
         for name, wrapper in model.variants.items():
             count = len(self._analyzer.findings)
             self._record(model, record, target.at("variants", name), dict(wrapper))
-            if (
-                len(self._analyzer.findings) > count
-            ):  # The variants share `fields` and would repeat its findings.
+            # The variants share `fields` and would repeat its findings.
+            if len(self._analyzer.findings) > count:
                 break
         return None
 
