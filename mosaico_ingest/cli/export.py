@@ -137,8 +137,7 @@ def _opened(
 
         yield StoreSequence(Store.open(store or DEFAULT_STORE, create=False), sequence)
         return
-    from mosaico_ingest.destinations.server.address import server_at
-    from mosaico_ingest.destinations.server.client import connect
+    from mosaico_ingest.destinations.server.client import connect, server_at
 
     with connect(server_at(server, api_key=api_key, tls_cert=tls_cert)) as client:
         yield ServerSequence(client, sequence)

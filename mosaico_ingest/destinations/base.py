@@ -1,19 +1,35 @@
-"""The interfaces of a destination: `Destination`, `Sink`, `Session` and `TopicWriter`."""
+"""The interfaces of a destination, and the registry that finds the destination of a target.
+
+A package adds a destination with an entry point of the group `mosaico_ingest.destinations`:
+
+    [project.entry-points."mosaico_ingest.destinations"]
+    lake = "my_package.lake:open_lake"
+
+The name selects it in a manifest (`target: {type: lake, options: {…}}`). The object is called with the options, a
+mapping, and the folder of the manifest, and returns a `Destination`.
+"""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Generator, Iterable, Mapping, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, ClassVar, Protocol, TypeAlias
 
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.errors import SequenceExists, SinkError
-from mosaico_ingest.findings import Finding
-from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy
+from mosaico_ingest.errors import IngestError, ManifestError, SequenceExists, SinkError
+from mosaico_ingest.findings import Finding, suggest_names
+from mosaico_ingest.job.values import (
+    IfExists,
+    PluginTarget,
+    ServerTarget,
+    SessionLevelErrorPolicy,
+    StoreTarget,
+    Target,
+)
 from mosaico_ingest.ontology.types import OntologyType
 
 ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
@@ -86,7 +102,7 @@ class Destination(ABC):
     """A store, a server or another system that sequences are written to.
 
     A destination is cheap to create and connects only when a method is called. Packages add destinations through the
-    entry point group `mosaico_ingest.destinations`; see `registry`.
+    entry point group `mosaico_ingest.destinations`; see the module.
     """
 
     kind: ClassVar[str]
@@ -322,3 +338,144 @@ def check_same_type(existing: OntologyType, new: OntologyType, *, where: str) ->
             where=where,
             hint="rename the topic in topic_settings, or replace the sequence",
         )
+
+
+def validated(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Return a received batch that is safe to process.
+
+    Raises:
+        pa.ArrowInvalid: The buffers are inconsistent, for example because offsets are out of range.
+    """
+    batch.validate(full=True)
+    return with_offsets(batch)
+
+
+def with_offsets(batch: pa.RecordBatch) -> pa.RecordBatch:
+    """Return the batch with complete offsets in every zero-length array; other arrays are not copied.
+
+    Writers such as arrow-rs omit these offsets. pyarrow accepts such arrays, but `nbytes`, `get_total_buffer_size` and
+    `offsets` read past the end of the missing buffer, which crashes the process.
+    """
+    columns = [_with_offsets(column) for column in batch.columns]
+    if all(new is old for new, old in zip(columns, batch.columns, strict=True)):
+        return batch
+    return pa.RecordBatch.from_arrays(columns, schema=batch.schema)
+
+
+def has_nested_lists(schema: pa.Schema) -> bool:
+    """Return whether a column has a list inside a list, so that its batches may lack offsets."""
+    return any(_list_depth(field.type) > 1 for field in schema)
+
+
+def _with_offsets(array: Any) -> Any:  # noqa: ANN401 - any array class
+    kind = array.type
+    if len(array) == 0:
+        return pa.array([], kind) if kind.num_fields else array
+    if isinstance(kind, pa.StructType):
+        return _complete_struct(array)
+    if isinstance(kind, pa.ListType | pa.LargeListType | pa.FixedSizeListType | pa.MapType):
+        return _complete_list(array)
+    return array
+
+
+def _complete_struct(array: Any) -> Any:  # noqa: ANN401 - a struct array
+    children = [array.field(i) for i in range(array.type.num_fields)]
+    complete = [_with_offsets(child) for child in children]
+    if all(new is old for new, old in zip(complete, children, strict=True)):
+        return array
+    # `field` has applied the offset of the struct to its children
+    mask = array.is_null() if array.null_count else None
+    return pa.StructArray.from_arrays(complete, fields=list(array.type), mask=mask)
+
+
+def _complete_list(array: Any) -> Any:  # noqa: ANN401 - a list or map array
+    values = array.values
+    complete = _with_offsets(values)
+    if complete is values:
+        return array
+    buffers = array.buffers()[: 1 if isinstance(array.type, pa.FixedSizeListType) else 2]
+    return pa.Array.from_buffers(array.type, len(array), buffers, array.null_count, array.offset, [complete])
+
+
+def _list_depth(kind: Any) -> int:  # noqa: ANN401 - any Arrow type
+    """Return the maximum number of nested list types."""
+    inner = max((_list_depth(kind.field(i).type) for i in range(kind.num_fields)), default=0)
+    return inner + (not isinstance(kind, pa.StructType) and kind.num_fields > 0)
+
+
+ENTRY_POINTS = "mosaico_ingest.destinations"
+
+DestinationFactory: TypeAlias = Callable[[Mapping[str, Any], Path], Destination]
+"""Creates a destination from the options of a manifest and the manifest's folder."""
+KeepOpen: TypeAlias = Callable[[Target], None]
+
+
+def destination_of(target: Target) -> Destination:
+    """Return the destination that a target selects.
+
+    Raises:
+        ManifestError: No installed package provides this type of destination, or it rejects the options.
+    """
+    return _FACTORIES.get(target.kind, _plugin)(target)
+
+
+@contextmanager
+def keep_destinations_open() -> Generator[KeepOpen]:
+    """Yield a function that keeps a target open until the context ends.
+
+    A batch of recordings uses it because closing a SQLite catalog for the last time costs a checkpoint.
+    """
+    locations: set[tuple[str, str]] = set()
+    with ExitStack() as stack:
+
+        def keep(target: Target) -> None:
+            with suppress(IngestError):  # opening the destination for the run reports the error
+                destination = destination_of(target)
+                location = (destination.kind, destination.describe())
+                context = None if location in locations else destination.keep_open()
+                if context is not None:
+                    stack.enter_context(context)
+                    locations.add(location)
+
+        yield keep
+
+
+def _store(target: StoreTarget) -> Destination:
+    from mosaico_ingest.destinations.store.destination import StoreDestination  # noqa: PLC0415 - Parquet is slow to import
+
+    return StoreDestination(target.path, target.compression)
+
+
+def _server(target: ServerTarget) -> Destination:
+    from mosaico_ingest.destinations.server.destination import ServerDestination  # noqa: PLC0415 - Flight is slow to import
+
+    return ServerDestination(target)
+
+
+def _plugin(target: PluginTarget) -> Destination:
+    from importlib.metadata import entry_points  # noqa: PLC0415 - slow to import, and only plugins need it
+
+    factories = {entry.name: entry for entry in entry_points(group=ENTRY_POINTS)}
+    if target.kind not in factories:
+        raise ManifestError(
+            f"no destination of type {target.kind!r} is installed",
+            where="target.type",
+            hint=suggest_names(factories, [target.kind]) or "install the package that provides it",
+        )
+    try:
+        factory: DestinationFactory = factories[target.kind].load()
+        return factory(target.options, target.base_dir)
+    except IngestError:
+        raise
+    except Exception as error:
+        raise SinkError(
+            f"the destination {target.kind!r} cannot be created: {type(error).__name__}: {error}",
+            where=factories[target.kind].value,
+            hint="check target.options and the package that provides the destination",
+        ) from error
+
+
+_FACTORIES: Mapping[str, Callable[[Any], Destination]] = {
+    StoreTarget.kind: _store,
+    ServerTarget.kind: _server,
+}

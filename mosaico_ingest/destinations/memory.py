@@ -19,11 +19,11 @@ from mosaico_ingest.destinations.base import (
     replacement_is_incomplete,
     sequence_exists,
     topic_schema,
+    with_offsets,
 )
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.protocol.batches import with_offsets
 
 
 @dataclass(slots=True)

@@ -31,7 +31,7 @@ class InProcess:
 
     def map(self, tasks: Iterable[Task], observe: BatchObserver) -> Iterator[Report]:
         """Yield the report of each task; see `Executor.map`."""
-        from mosaico_ingest.destinations.registry import keep_destinations_open  # noqa: PLC0415 - choosing an executor must not load it
+        from mosaico_ingest.destinations.base import keep_destinations_open  # noqa: PLC0415 - choosing an executor must not load it
         from mosaico_ingest.executors.groups import commit_groups  # noqa: PLC0415 - the same
         from mosaico_ingest.pipeline.run import run_group  # noqa: PLC0415 - choosing an executor must not load the pipeline
 

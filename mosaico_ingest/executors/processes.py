@@ -18,7 +18,7 @@ from multiprocessing.reduction import ForkingPickler
 import pyarrow as pa
 from msgspec import Struct, structs
 
-from mosaico_ingest.destinations.registry import KeepOpen, keep_destinations_open
+from mosaico_ingest.destinations.base import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.base import InProcess, do_nothing
 from mosaico_ingest.executors.batch import Batch, Registrations

@@ -15,8 +15,8 @@ from typing import Any
 
 from msgspec import Struct, structs
 
-from mosaico_ingest.destinations.registry import destination_of
-from mosaico_ingest.destinations.store.errors import translate_errors
+from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.destinations.store.files import translate_errors
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.batch import Batch, Registrations
 from mosaico_ingest.executors.processes import ATTEMPTS

@@ -16,7 +16,7 @@ import pyarrow as pa
 import ray
 from msgspec import Struct
 
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
 from mosaico_ingest.executors.batch import Registrations
 from mosaico_ingest.interrupts import StopHandler

@@ -12,7 +12,7 @@ from pathlib import Path
 from msgspec import Struct, structs
 
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import JobSettings
 from mosaico_ingest.metadata.schema import schema_files

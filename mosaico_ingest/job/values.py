@@ -208,7 +208,7 @@ class ServerTarget:
 
 
 class PluginTarget(Struct, frozen=True):
-    """A destination that an installed package provides; see `mosaico_ingest.destinations.registry`."""
+    """A destination that an installed package provides; see `mosaico_ingest.destinations.base`."""
 
     kind: str
     """The name of its entry point."""

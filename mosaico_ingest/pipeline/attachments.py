@@ -8,8 +8,7 @@ from typing import Any, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import AttachableSession, Attached, Session
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import AttachableSession, Attached, Session, destination_of
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job

@@ -11,8 +11,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.contracts.order import FileOrder
 from mosaico_ingest.contracts.recording_monitor import RecordingMonitor, summary
-from mosaico_ingest.destinations.base import AmendableSession, Session
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import AmendableSession, Session, destination_of
 from mosaico_ingest.errors import ContractError
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import PROVENANCE_KEY, OnFailure

@@ -10,8 +10,7 @@ from typing import TypeVar
 
 from msgspec import structs
 
-from mosaico_ingest.destinations.base import ExistingSequence
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import ExistingSequence, destination_of
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.pipeline.fingerprint import fingerprint

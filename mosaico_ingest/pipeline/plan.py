@@ -16,7 +16,7 @@ from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
 from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract, ReadTopic
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.documents import Part, Unchecked
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSettings

@@ -11,7 +11,7 @@ from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
 from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at

@@ -14,9 +14,14 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
-from mosaico_ingest.destinations.base import ExistingSequence, Session, StoredTopic, check_same_type
+from mosaico_ingest.destinations.base import (
+    ExistingSequence,
+    Session,
+    StoredTopic,
+    check_same_type,
+    destination_of,
+)
 from mosaico_ingest.destinations.memory import MemorySink
-from mosaico_ingest.destinations.registry import destination_of
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job

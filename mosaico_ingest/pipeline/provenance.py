@@ -15,8 +15,7 @@ from msgspec import Struct
 from pydantic import BaseModel, ConfigDict, ValidationError
 from xxhash import xxh3_128
 
-from mosaico_ingest.destinations.base import ExistingSequence
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import ExistingSequence, destination_of
 from mosaico_ingest.errors import BagError, SequenceExists
 from mosaico_ingest.findings import escape_undecodable
 from mosaico_ingest.job.split import SPLIT_KEY

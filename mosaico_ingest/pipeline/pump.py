@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic, destination_of
 from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import DeferredInterrupt

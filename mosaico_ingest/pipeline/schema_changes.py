@@ -10,7 +10,7 @@ from typing import Any
 from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import recorded_schema
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.values import OnSchemaChange

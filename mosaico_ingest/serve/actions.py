@@ -9,7 +9,7 @@ from typing import Any
 from msgspec import Struct
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.store.errors import NotInStore
+from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.destinations.store.model import Note
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages

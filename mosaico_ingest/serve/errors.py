@@ -10,7 +10,7 @@ from contextlib import contextmanager
 import pyarrow as pa
 import pyarrow.flight as fl
 
-from mosaico_ingest.destinations.store.errors import NotInStore
+from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.errors import SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import Malformed

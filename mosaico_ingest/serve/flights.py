@@ -10,10 +10,10 @@ import pyarrow as pa
 import pyarrow.flight as fl
 
 from mosaico_ingest import protocol
+from mosaico_ingest.destinations.base import with_offsets
 from mosaico_ingest.destinations.store.model import SequenceInfo, SessionInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store, Window, count, scan
 from mosaico_ingest.protocol import messages
-from mosaico_ingest.protocol.batches import with_offsets
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import JSON, Body, Interval
 from mosaico_ingest.serve.errors import Refusal, refuse_invalid

@@ -20,9 +20,9 @@ import pyarrow.flight as fl
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.protocol import key_fingerprint, key_problem, new_key
 from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import API_KEY_HEADER, Permission
-from mosaico_ingest.protocol.names import key_fingerprint, key_problem, new_key
 from mosaico_ingest.serve.errors import Refusal
 
 MIDDLEWARE = "api-key"

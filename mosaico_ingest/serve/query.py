@@ -23,7 +23,7 @@ import pyarrow.dataset as ds
 from msgspec import Struct
 from numpy.typing import NDArray
 
-from mosaico_ingest.destinations.store.errors import translate_errors
+from mosaico_ingest.destinations.store.files import translate_errors
 from mosaico_ingest.destinations.store.model import SegmentInfo, SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages

@@ -12,15 +12,14 @@ from uuid import uuid4
 import pyarrow as pa
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import ENVELOPE
-from mosaico_ingest.destinations.store.errors import NotInStore
+from mosaico_ingest.destinations.base import ENVELOPE, validated
+from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.destinations.store.session import StoreSession, StoreTopic
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.protocol import messages
-from mosaico_ingest.protocol.batches import validated
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Refusal, refuse_invalid
 

@@ -13,8 +13,7 @@ import numpy.typing as npt
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.destinations.store.errors import translate_errors
-from mosaico_ingest.destinations.store.files import opened
+from mosaico_ingest.destinations.store.files import opened, translate_errors
 from mosaico_ingest.destinations.store.model import SegmentInfo, TopicInfo
 from mosaico_ingest.destinations.store.segment import time_span
 from mosaico_ingest.destinations.store.store import Window, scan

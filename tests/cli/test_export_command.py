@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.destinations.server.address import server_at
+from mosaico_ingest.destinations.server.client import server_at
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

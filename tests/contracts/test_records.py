@@ -11,10 +11,8 @@ from object_store import ObjectStore
 
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.destinations.store.errors import NotInStore
-from mosaico_ingest.destinations.store.files import new_session_id
-from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
-from mosaico_ingest.destinations.store.protocols import StoreCatalog
+from mosaico_ingest.destinations.store.files import NotInStore, new_session_id
+from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic, StoreCatalog
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists

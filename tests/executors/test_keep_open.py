@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.destinations.registry import keep_destinations_open
-from mosaico_ingest.destinations.store import Store, connections
+from mosaico_ingest.destinations.base import keep_destinations_open
+from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store import sqlite as connections
 from mosaico_ingest.errors import SequenceExists
 from mosaico_ingest.executors.base import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig

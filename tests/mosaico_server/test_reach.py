@@ -100,7 +100,7 @@ def test_connect_to_closed_port_raises_sink_unavailable(monkeypatch: pytest.Monk
 
 
 def test_connect_to_silent_port_raises_sink_unavailable(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mosaico_ingest.destinations.server.errors._PATIENCE_S", 0.2)
+    monkeypatch.setattr("mosaico_ingest.destinations.server.client._PATIENCE_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         target = ServerTarget("127.0.0.1", silent.getsockname()[1])
         with pytest.raises(SinkUnavailable), connect(target, response_s=0.3):

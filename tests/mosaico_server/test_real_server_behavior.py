@@ -15,15 +15,13 @@ import pytest
 from hollow_batches import hollow_batch, malformed_batch
 from mosaicod import Mosaicod, Topic, running
 
-from mosaico_ingest.destinations.base import topic_schema
-from mosaico_ingest.destinations.registry import destination_of
+from mosaico_ingest.destinations.base import destination_of, has_nested_lists, topic_schema, validated
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.ontology.registry import MODULES, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.protocol.batches import has_nested_lists, validated
 
 BLOB = OntologyType("Blob", pa.struct([pa.field("data", pa.binary())]))
 NESTED = OntologyType("Nested", pa.struct([pa.field("a", pa.list_(pa.list_(pa.list_(pa.int8()))))]))

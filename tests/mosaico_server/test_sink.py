@@ -17,9 +17,8 @@ import pytest
 from mosaicod import Mosaicod, Proxy, exists, make_key, precondition, running
 
 from mosaico_ingest.destinations.base import topic_schema
-from mosaico_ingest.destinations.server.client import connect
+from mosaico_ingest.destinations.server.client import Address, connect
 from mosaico_ingest.destinations.server.destination import ServerDestination, ServerSink
-from mosaico_ingest.destinations.server.errors import Address
 from mosaico_ingest.destinations.server.session import ServerSession
 from mosaico_ingest.errors import Interrupted, SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
@@ -485,8 +484,8 @@ def test_upload_to_stuck_server_raises_after_timeout_and_deletes_sequence(
     server: Mosaicod, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The timeout applies once, not once per topic."""
-    monkeypatch.setattr("mosaico_ingest.destinations.server.upload._UPLOAD_S", 0.3)
-    monkeypatch.setattr("mosaico_ingest.destinations.server.upload._LOCK_S", 0.2)
+    monkeypatch.setattr("mosaico_ingest.destinations.server.session._UPLOAD_S", 0.3)
+    monkeypatch.setattr("mosaico_ingest.destinations.server.session._LOCK_S", 0.2)
     going_on = threading.Event()
     server.faults.before_batch = lambda _topic, _number: going_on.wait(20) and None
     begin = time.monotonic()

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.destinations.server.upload import framing_bytes, row_spans
+from mosaico_ingest.destinations.server.session import framing_bytes, row_spans
 
 POINT = pa.struct([pa.field("x", pa.float64()), pa.field("name", pa.string())])
 BOX = pa.struct([pa.field("x", pa.int32()), pa.field("ok", pa.bool_())])

@@ -15,6 +15,8 @@ from mosaico_ingest.protocol import (
     check_metadata,
     check_sequence_name,
     check_topic_name,
+    key_problem,
+    new_key,
 )
 from mosaico_ingest.protocol import (
     messages as actions,
@@ -29,7 +31,6 @@ from mosaico_ingest.protocol.errors import (
     text_of,
 )
 from mosaico_ingest.protocol.messages import ACTIONS, JSON, Malformed, Permission
-from mosaico_ingest.protocol.names import key_problem, new_key
 
 
 @pytest.mark.parametrize("name", ["run_1", "a@b", "~x", "-"])

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pytest
 from object_store import ObjectStore
 
-from mosaico_ingest.destinations.store import SequenceSummary, Store, StoreSink, object_catalog, snapshot
+from mosaico_ingest.destinations.store import SequenceSummary, Store, StoreSink, object_catalog
+from mosaico_ingest.destinations.store import documents as snapshot
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.remote import RemotePath, as_path

@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.destinations.store.checksum import ContentHash, column_makers, combined
+from mosaico_ingest.destinations.store.segment import ContentHash, column_makers, combined
 
 WORD = st.text(max_size=4)
 ROW = st.fixed_dictionaries(

@@ -16,9 +16,9 @@ from flight_calls import Client, refused
 
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.errors import SinkError
+from mosaico_ingest.protocol import key_fingerprint
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Permission
-from mosaico_ingest.protocol.names import key_fingerprint
 from mosaico_ingest.serve import Keyring, Limits, responds, serve
 
 Rows = Callable[..., pa.RecordBatch]

@@ -23,8 +23,7 @@ from disks import MEBIBYTE, read_only, small_disk
 
 from mosaico_ingest.destinations.store import Store, StoreSink, catalog
 from mosaico_ingest.destinations.store.catalog import FORMAT, Catalog
-from mosaico_ingest.destinations.store.errors import translate_errors
-from mosaico_ingest.destinations.store.files import Lease, is_live
+from mosaico_ingest.destinations.store.files import Lease, is_live, translate_errors
 from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.ontology.types import OntologyType

@@ -15,7 +15,7 @@ from object_store import ObjectStore
 
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import SequenceSummary, Store, StoreSink
-from mosaico_ingest.destinations.store.listing import SequenceFilter
+from mosaico_ingest.destinations.store.model import SequenceFilter
 from mosaico_ingest.ontology.types import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]

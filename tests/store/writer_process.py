@@ -10,8 +10,7 @@ import pyarrow as pa
 
 from mosaico_ingest.destinations.base import Session, topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.destinations.store.commit import commit_sessions
-from mosaico_ingest.destinations.store.session import StoreSession
+from mosaico_ingest.destinations.store.session import StoreSession, commit_sessions
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType
 

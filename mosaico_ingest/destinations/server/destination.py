@@ -18,9 +18,8 @@ from mosaico_ingest.destinations.base import (
     Session,
     Sink,
 )
-from mosaico_ingest.destinations.server.client import ServerClient
+from mosaico_ingest.destinations.server.client import Refused, ServerClient, add_hint
 from mosaico_ingest.destinations.server.client import connect as connect_to
-from mosaico_ingest.destinations.server.errors import Refused, add_hint
 from mosaico_ingest.destinations.server.session import ServerSession
 from mosaico_ingest.errors import IngestError, Interrupted, SinkError
 from mosaico_ingest.findings import Finding, Severity

@@ -6,12 +6,13 @@ and no sequence or topic name can refer to a path outside the store. The package
 
 from __future__ import annotations
 
-from mosaico_ingest.destinations.store.listing import Listing, SequenceSummary
 from mosaico_ingest.destinations.store.model import (
     Collected,
+    Listing,
     Note,
     SegmentInfo,
     SequenceInfo,
+    SequenceSummary,
     SessionInfo,
     TopicInfo,
 )

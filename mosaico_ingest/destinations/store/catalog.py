@@ -21,19 +21,11 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
-from mosaico_ingest.destinations.store import schemas
-from mosaico_ingest.destinations.store.connections import (
-    BUSY_S,
-    Handle,
-    connect,
-    connection,
-    find_open,
-    keep_open,
-)
-from mosaico_ingest.destinations.store.errors import NotInStore, sequence_changed, translate_errors
-from mosaico_ingest.destinations.store.listing import Listing, SequenceFilter, family_topics, listing
+from mosaico_ingest.destinations.store import sqlite
+from mosaico_ingest.destinations.store.files import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.model import (
     Claim,
+    Listing,
     MergedSegment,
     NewNote,
     NewSession,
@@ -41,6 +33,7 @@ from mosaico_ingest.destinations.store.model import (
     Note,
     Replacement,
     SegmentInfo,
+    SequenceFilter,
     SequenceInfo,
     SessionInfo,
     TopicInfo,
@@ -48,6 +41,16 @@ from mosaico_ingest.destinations.store.model import (
     check_not_merged,
 )
 from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.destinations.store.sqlite import (
+    BUSY_S,
+    Handle,
+    connect,
+    connection,
+    family_topics,
+    find_open,
+    keep_open,
+    listing,
+)
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
@@ -338,7 +341,7 @@ def _initialize(db: sqlite3.Connection, path: Path) -> None:
         return
     db.execute("BEGIN IMMEDIATE")
     if _format(db, path) == 0:  # another process may have been faster
-        for statement in (_TABLES + schemas.TABLE).split(";"):
+        for statement in (_TABLES + sqlite.TABLE).split(";"):
             db.execute(statement)
         db.execute(f"PRAGMA application_id = {_APPLICATION}")
         db.execute(f"PRAGMA user_version = {FORMAT}")
@@ -369,7 +372,7 @@ def _convert(db: sqlite3.Connection) -> int:
     if _version(db) == 1:  # another process may have been faster
         for column in _missing_columns(db):
             db.execute(f"ALTER TABLE segments ADD COLUMN {column} TEXT")
-        schemas.convert(db)
+        sqlite.convert(db)
         db.execute(f"PRAGMA user_version = {FORMAT}")
     db.execute("COMMIT")
     return _version(db)
@@ -467,7 +470,7 @@ def _topics(db: sqlite3.Connection, sequence_id: int, name: str, root: Path) -> 
             name=row["name"],
             session=row["session_id"],
             ontology=_ontology_of(db, row),
-            schema=schemas.schema_of(db, row),
+            schema=sqlite.schema_of(db, row),
             metadata=json.loads(row["metadata"]),
             created_ns=row["created_ns"],
             segments=tuple(segments[row["id"]]),
@@ -634,7 +637,7 @@ def _topic(db: sqlite3.Connection, sequence_id: int, session: str, topic: NewTop
             topic.ontology.tag,
             topic.ontology.serialization_format.value,
             topic.ontology.fingerprint,
-            schemas.store_schema(db, topic.schema),
+            sqlite.store_schema(db, topic.schema),
             topic.metadata,
             topic.created_ns,
         ),
@@ -697,7 +700,7 @@ def _types(db: sqlite3.Connection, sequence_id: int) -> dict[str, OntologyType]:
 
 def _ontology_of(db: sqlite3.Connection, row: sqlite3.Row) -> OntologyType:
     """Return the ontology type of a row of `topics`."""
-    columns = list(schemas.schema_of(db, row))[1:]
+    columns = list(sqlite.schema_of(db, row))[1:]
     return OntologyType(
         row["ontology_tag"], pa.struct(columns), SerializationFormat(row["serialization_format"])
     )
@@ -750,7 +753,7 @@ def _forget(db: sqlite3.Connection, live: Collection[str]) -> set[str]:
     for row in db.execute("SELECT session_id FROM reservations").fetchall():
         if row["session_id"] not in live:
             db.execute("DELETE FROM reservations WHERE session_id = ?", (row["session_id"],))
-    schemas.remove_unused(db)
+    sqlite.remove_unused(db)
     return set(_paths(db, "?", 1))
 
 

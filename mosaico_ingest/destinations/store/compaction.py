@@ -14,8 +14,7 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.destinations.store import files
-from mosaico_ingest.destinations.store.errors import translate_errors
-from mosaico_ingest.destinations.store.files import new_session_id
+from mosaico_ingest.destinations.store.files import new_session_id, translate_errors
 from mosaico_ingest.destinations.store.model import (
     Replacement,
     SegmentInfo,

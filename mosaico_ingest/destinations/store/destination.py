@@ -20,9 +20,8 @@ from mosaico_ingest.destinations.base import (
     Session,
     Sink,
 )
-from mosaico_ingest.destinations.store.commit import commit_sessions
 from mosaico_ingest.destinations.store.model import SequenceInfo
-from mosaico_ingest.destinations.store.session import StoreSession, StoreSink
+from mosaico_ingest.destinations.store.session import StoreSession, StoreSink, commit_sessions
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError, Unreachable
 from mosaico_ingest.job.values import Compression

@@ -1,17 +1,19 @@
-"""The content of a catalog: sequences, sessions, topics and segments, and the changes that a session makes."""
+"""The content of a catalog, the changes that a session makes, and the interfaces of a store's parts."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import json
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from typing import TYPE_CHECKING, Any
+from fnmatch import fnmatchcase
+from typing import TYPE_CHECKING, Any, Protocol
 
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.destinations.store.checksum import combined
-from mosaico_ingest.destinations.store.errors import NotInStore
-from mosaico_ingest.destinations.store.segment import Segment
+from mosaico_ingest.destinations.base import FamilyTopic
+from mosaico_ingest.destinations.store.files import NotInStore
+from mosaico_ingest.destinations.store.segment import Segment, combined
 from mosaico_ingest.errors import SinkError, missing_library
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
     import pandas as pd
     import polars as pl
 
-    from mosaico_ingest.destinations.store.tables import Moment
+    from mosaico_ingest.destinations.store.store import Moment
 
 
 class MergedSegment(Struct, frozen=True):
@@ -127,7 +129,7 @@ class TopicInfo(Struct, frozen=True):
         Raises:
             SinkError: A column does not exist, or a text is not a time.
         """
-        from mosaico_ingest.destinations.store.tables import read_table  # noqa: PLC0415 - it reads topics
+        from mosaico_ingest.destinations.store.store import read_table  # noqa: PLC0415 - it reads topics
 
         return read_table(self, start=start, end=end, columns=columns, flatten=flatten)
 
@@ -138,7 +140,7 @@ class TopicInfo(Struct, frozen=True):
         columns: Sequence[str] | None = None,
     ) -> pa.RecordBatchReader:
         """Return a reader of the rows, for topics larger than memory; `columns` are names of top-level columns."""
-        from mosaico_ingest.destinations.store.tables import topic_reader  # noqa: PLC0415 - it reads topics
+        from mosaico_ingest.destinations.store.store import topic_reader  # noqa: PLC0415 - it reads topics
 
         return topic_reader(self, start=start, end=end, columns=columns)
 
@@ -416,3 +418,251 @@ def reason_incomplete(notes: Iterable[Note], *, has_session: bool) -> str | None
 
 def _not_none(times: Iterable[int | None]) -> list[int]:
     return [time for time in times if time is not None]
+
+
+class SequenceFilter(Struct, frozen=True):
+    """Which sequences a listing contains."""
+
+    match: str | None = None
+    """A glob for the names, with `*`, `?` and `[…]`."""
+    metadata: Mapping[str, str] = {}
+    """Values by key; `vehicle.id` is the key `id` inside of `vehicle`. Values are compared as text, as in JSON."""
+    incomplete: bool = False
+    """Select only sequences whose last run ended with an error, or that no run finished."""
+
+    def selects(self, info: SequenceInfo | SequenceSummary) -> bool:
+        """Return whether a sequence passes the filter; catalogs that cannot query use this method."""
+        return (
+            (self.match is None or fnmatchcase(info.name, self.match))
+            and (not self.incomplete or info.incomplete is not None)
+            and all(_text_at(info.metadata, key) == value for key, value in self.metadata.items())
+        )
+
+
+class SequenceSummary(Struct, frozen=True):
+    """The counts of one sequence, without its topics."""
+
+    name: str
+    metadata: Mapping[str, Any]
+    topics: int
+    rows: int
+    stored_bytes: int
+    start_ns: int | None
+    """The smallest time stamp, or None without rows."""
+    end_ns: int | None
+    """The largest time stamp, inclusive, or None without rows."""
+    incomplete: str | None
+    """See `SequenceInfo.incomplete`."""
+    notes: tuple[Note, ...]
+
+    @classmethod
+    def of(cls, info: SequenceInfo) -> SequenceSummary:
+        """Return the summary of a complete entry."""
+        return cls(
+            info.name,
+            info.metadata,
+            len(info.topics),
+            info.rows,
+            info.stored_bytes,
+            info.start_ns,
+            info.end_ns,
+            info.incomplete,
+            info.notes,
+        )
+
+
+class Listing(Struct, frozen=True):
+    """One page of a listing, sorted by name."""
+
+    sequences: tuple[SequenceSummary, ...]
+    total: int
+    """Number of sequences that pass the filter, on all pages."""
+    next_after: str | None
+    """The `after` of the next page, or None for the last page."""
+
+
+def _text_at(metadata: Mapping[str, Any], key: str) -> str | None:
+    """Return the value at a dotted key as text, or None if the metadata has no such key."""
+    value: Any = metadata
+    for part in key.split("."):
+        if not isinstance(value, Mapping) or part not in value:
+            return None
+        value = value[part]
+    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"), ensure_ascii=False)
+
+
+class Lease(Protocol):
+    """Shows other processes that a writer is alive."""
+
+    def release(self) -> None:
+        """Release the lease; a second call has no effect."""
+        ...
+
+
+class Closable(Protocol):
+    """An object that can be closed."""
+
+    def close(self) -> None:
+        """Close it."""
+        ...
+
+
+class Files(Protocol):
+    """The files of a store: `LocalFiles` on a disk, `ObjectFiles` behind a URL."""
+
+    @property
+    def root(self) -> AnyPath:
+        """The folder of the store."""
+        ...
+
+    def topic(self, sequence: str, topic: str) -> AnyPath:
+        """Return the folder of a topic's segments."""
+        ...
+
+    def staged(self, session: str, sequence: str, topic: str, number: int) -> AnyPath:
+        """Return the path at which a session writes a segment before the commit."""
+        ...
+
+    def attachment(self, sequence: str, name: str) -> AnyPath:
+        """Return the path of an attachment after the commit."""
+        ...
+
+    def staged_attachment(self, session: str, sequence: str, name: str) -> AnyPath:
+        """Return the path at which a session writes an attachment before the commit."""
+        ...
+
+    def relative(self, path: AnyPath) -> str:
+        """Return a segment's path relative to the store, as in the catalog."""
+        ...
+
+    def begin(self, session: str) -> Lease:
+        """Prepare a session and return the lease that shows that its writer is alive."""
+        ...
+
+    def is_live(self, session: str) -> bool:
+        """Return whether the session's writer is alive."""
+        ...
+
+    def in_use(self, session: str, grace_s: float) -> bool:
+        """Return whether the session's writer is alive or may be about to start."""
+        ...
+
+    def sync(self, paths: Sequence[AnyPath]) -> None:
+        """Wait until closed files are on the disk."""
+        ...
+
+    def publish(self, moves: Mapping[AnyPath, AnyPath]) -> None:
+        """Move synced files to their final paths, so that they survive a power cut; files that were moved are skipped."""
+        ...
+
+    def remove(self, paths: Iterable[AnyPath]) -> None:
+        """Remove segments; garbage collection retries failed removals."""
+        ...
+
+    def discard(self, session: str) -> None:
+        """Remove the staged files of a session."""
+        ...
+
+    def open_sessions(self) -> list[str]:
+        """Return the sessions that were started and not ended, alive or not."""
+        ...
+
+    def staged_files(self, session: str) -> list[AnyPath]:
+        """Return the segments that a session started and did not publish."""
+        ...
+
+    def segment_files(self) -> Iterator[AnyPath]:
+        """Yield every file below the folder of segments."""
+        ...
+
+
+class StoreCatalog(Protocol):
+    """The catalog of a store: `Catalog` in SQLite, `ObjectCatalog` as JSON documents behind a URL.
+
+    Every change is atomic. Methods that remove entries return the paths of segments that are no longer needed.
+    """
+
+    def keep_open(self) -> Closable:
+        """Return a handle that keeps the catalog open, which makes calls cheaper until it is closed."""
+        ...
+
+    def claim(
+        self, session: str, sequence: str, if_exists: IfExists, *, is_live: Callable[[str], bool]
+    ) -> Claim:
+        """Claim a sequence for a session.
+
+        Raises:
+            SequenceExists: The sequence exists and `if_exists` forbids it, or another session writes it.
+        """
+        ...
+
+    def commit(self, sessions: Sequence[tuple[Claim, NewSession]]) -> list[str]:
+        """Add sessions and return the paths of the segments they replace.
+
+        A catalog with transactions adds all of them, or none if one cannot be added. Others commit one session at a time.
+        """
+        ...
+
+    def replace_segments(self, change: Replacement) -> bool:
+        """Enter a merged segment in place of others; False if one of them is not in the catalog any more."""
+        ...
+
+    def release(self, session: str, sequence: str) -> None:
+        """Release the claim of a session."""
+        ...
+
+    def create(self, sequence: str, metadata: str) -> None:
+        """Add a sequence without a session."""
+        ...
+
+    def note(self, sequence: str, new: NewNote) -> None:
+        """Attach a note to an existing sequence."""
+        ...
+
+    def names(self) -> list[str]:
+        """Return the sorted names of all sequences."""
+        ...
+
+    def sequence(self, name: str) -> SequenceInfo | None:
+        """Return a sequence, or None."""
+        ...
+
+    def headers(self, names: Collection[str]) -> tuple[SequenceInfo, ...]:
+        """Return the sequences with these names, without their topics, in any order."""
+        ...
+
+    def sequences(self) -> tuple[SequenceInfo, ...]:
+        """Return every sequence by name, in one consistent state if the catalog supports it."""
+        ...
+
+    def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
+        """Return the selected sequences after the name `after`, at most `limit`, sorted by name."""
+        ...
+
+    def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
+        """Return the topics with these names that sessions of the family created, oldest session first."""
+        ...
+
+    def bounds(self, topic: TopicInfo, columns: Collection[str]) -> dict[AnyPath, dict[str, tuple[Any, Any]]]:
+        """Return the bounds of columns by segment path."""
+        ...
+
+    def delete_sequence(self, sequence: str) -> list[str]:
+        """Remove a sequence; raises NotInStore if it does not exist."""
+        ...
+
+    def delete_topic(self, sequence: str, topic: str) -> list[str]:
+        """Remove a topic; raises NotInStore if it does not exist."""
+        ...
+
+    def delete_session(self, sequence: str, session: str) -> list[str]:
+        """Remove everything a session added; raises NotInStore if it does not exist."""
+        ...
+
+    def delete_notes(self, sequence: str, topic: str | None) -> None:
+        """Remove the notes of a sequence itself, or of one of its topics."""
+        ...
+
+    def forget(self, live: Collection[str]) -> set[str]:
+        """Remove the claims of sessions that are not alive and return the paths of all segments."""
+        ...

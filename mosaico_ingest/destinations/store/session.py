@@ -1,4 +1,4 @@
-"""A writing session of the store: topics, staged segments and one atomic commit."""
+"""Writing sessions of a store: buffered rows, threads that write row groups, and the group commit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, closing, contextmanager, suppress
 from functools import partial
 from typing import Any
@@ -25,20 +25,18 @@ from mosaico_ingest.destinations.base import (
     StoredTopic,
     check_batch,
     check_same_type,
+    has_nested_lists,
     replacement_is_incomplete,
+    with_offsets,
 )
 from mosaico_ingest.destinations.store import files
-from mosaico_ingest.destinations.store.checksum import combined
-from mosaico_ingest.destinations.store.commit import Closed, commit_sessions
-from mosaico_ingest.destinations.store.errors import translate_errors
-from mosaico_ingest.destinations.store.files import new_session_id
-from mosaico_ingest.destinations.store.group_writers import Group, GroupWriters
-from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic
-from mosaico_ingest.destinations.store.protocols import Files, StoreCatalog
+from mosaico_ingest.destinations.store.files import new_session_id, translate_errors
+from mosaico_ingest.destinations.store.model import Claim, Files, NewNote, NewSession, NewTopic, StoreCatalog
 from mosaico_ingest.destinations.store.segment import (
     Segment,
     SegmentWriter,
     columns_of,
+    combined,
     sorted_rows,
     time_span,
 )
@@ -46,8 +44,101 @@ from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, Compression, IfExists
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.protocol.batches import has_nested_lists, with_offsets
 from mosaico_ingest.remote import AnyPath, RemotePath
+
+Group = Future[None]
+"""A row group that is written or waits; its result is an error or None."""
+
+
+class GroupWriters:
+    """Writes row groups on threads. `submit` blocks while each thread has a group, which limits the memory."""
+
+    def __init__(self, threads: int) -> None:
+        self._pool = ThreadPoolExecutor(threads, thread_name_prefix="group")
+        self._slots = threading.BoundedSemaphore(threads)
+        self._error: BaseException | None = None
+
+    def submit(self, previous: Group | None, write: Callable[[], None]) -> Group:
+        """Write a group after the previous group of its topic; an error of that group is the error of this group too."""
+        self._slots.acquire()
+        return self._pool.submit(self._write, previous, write)
+
+    def check(self) -> None:
+        """Raise the first error of any group."""
+        if self._error is not None:
+            raise self._error
+
+    def close(self) -> None:
+        """Drop the groups that wait, and wait for the others."""
+        self._pool.shutdown(cancel_futures=True)
+
+    def _write(self, previous: Group | None, write: Callable[[], None]) -> None:
+        try:
+            if previous is not None:
+                previous.result()  # it started earlier, so it does not wait for this thread
+            write()
+        except BaseException as error:
+            self._error = self._error or error
+            raise
+        finally:
+            self._slots.release()
+
+
+class Closed(Struct, frozen=True):
+    """What a closed session commits."""
+
+    claim: Claim
+    new: NewSession
+    unsynced: tuple[AnyPath, ...]
+    """The staged files that may not be on the disk yet."""
+    moves: Mapping[AnyPath, AnyPath]
+    """The final path of each staged file."""
+    obsolete: tuple[AnyPath, ...]
+    """The files of the stored sequence that are in no catalog table and that the commit replaces."""
+
+
+def commit_sessions(sessions: Sequence[StoreSession]) -> list[Exception | None]:
+    """Commit closed sessions of one store in one transaction; return the error of each session, or None.
+
+    If they cannot be committed together, each is committed alone, so that an error affects only its own session. If their
+    files cannot be synced, all of them fail, because the system reports an error of the disk only once. A session with an
+    error is discarded.
+    """
+    layout = sessions[0].layout
+    try:
+        with translate_errors(layout.root):
+            layout.sync([path for session in sessions for path in session.closed.unsynced])
+    except BaseException as error:
+        for session in sessions:
+            session.discard()
+        if isinstance(error, Exception):
+            return [error] * len(sessions)
+        raise
+    return _publish(sessions)
+
+
+def _publish(sessions: Sequence[StoreSession]) -> list[Exception | None]:
+    """Move the files of the sessions to their final paths, and enter the sessions in the catalog."""
+    layout, catalog = sessions[0].layout, sessions[0].catalog
+    contents = [session.closed for session in sessions]
+    try:
+        with translate_errors(layout.root):
+            layout.publish({staged: final for each in contents for staged, final in each.moves.items()})
+        replaced = catalog.commit([(each.claim, each.new) for each in contents])
+    except BaseException as error:
+        if isinstance(error, Exception) and len(sessions) > 1:
+            return [result for session in sessions for result in _publish([session])]
+        for session in sessions:
+            session.withdraw()
+        if isinstance(error, Exception):
+            return [error]
+        raise
+    for session in sessions:
+        session.leave()
+    obsolete = [path for each in contents for path in each.obsolete]
+    layout.remove([*(layout.root / path for path in replaced), *obsolete])
+    return [None] * len(sessions)
+
 
 _FIRST_GROUP_BYTES, _GROUP_BYTES = 4 << 20, 32 << 20
 """Size of the first and the largest row group. Sizes double in between, so that writing starts early."""
