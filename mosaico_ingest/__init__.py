@@ -41,7 +41,8 @@ if TYPE_CHECKING:
     )
     from mosaico_ingest.ontology import Message, Serializable
     from mosaico_ingest.protocol.messages import Permission as APIKeyPermissionEnum
-    from mosaico_ingest.report.model import Report, RunReport
+    from mosaico_ingest.report.files import RunReport
+    from mosaico_ingest.report.model import Report
     from mosaico_ingest.rosbag.blocks import ROSMessage
     from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
     from mosaico_ingest.rosbag.loader import ROSLoader

@@ -28,7 +28,8 @@ from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
-from mosaico_ingest.report.model import Report, RunReport, UsedManifest
+from mosaico_ingest.report.files import RunReport, UsedManifest
+from mosaico_ingest.report.model import Report
 from mosaico_ingest.textfile import read_limited
 from mosaico_ingest.version import __version__
 

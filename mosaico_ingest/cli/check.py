@@ -67,7 +67,7 @@ def check(
     from mosaico_ingest import api
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
     from mosaico_ingest.pipeline.contract_check import needs_times_only
-    from mosaico_ingest.report.model import gravest
+    from mosaico_ingest.report.files import gravest
 
     collect_garbage_as_usual()
     if expect is None and store is not None:

@@ -12,7 +12,7 @@ from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.lint.formats import Case, Suite, junit_text, sarif_text
 from mosaico_ingest.pipeline.plan_document import RecordingPlan
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
-from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.report.files import RunReport
 
 
 class CheckedRecording(Struct, frozen=True):

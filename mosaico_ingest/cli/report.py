@@ -27,7 +27,8 @@ from mosaico_ingest.report.units import (
 
 if TYPE_CHECKING:
     from mosaico_ingest.report.compare import Comparison
-    from mosaico_ingest.report.model import Report, RunReport, TopicReport
+    from mosaico_ingest.report.files import RunReport
+    from mosaico_ingest.report.model import Report, TopicReport
     from mosaico_ingest.services.inspection import Inspection
 
 WIDE = 100

@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
     from mosaico_ingest.job.model import Job
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.report.model import RunReport, UsedManifest
+    from mosaico_ingest.report.files import RunReport, UsedManifest
 
 T = TypeVar("T")
 

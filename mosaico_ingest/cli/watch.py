@@ -122,7 +122,7 @@ def watch(
     from mosaico_ingest.cli.process import collect_garbage_as_usual, interrupt_on_sigterm
     from mosaico_ingest.job.manifest import load_manifests
     from mosaico_ingest.remote import as_path, with_network
-    from mosaico_ingest.report.model import gravest
+    from mosaico_ingest.report.files import gravest
     from mosaico_ingest.services.watch import Arrivals
 
     set_up_logging(log)

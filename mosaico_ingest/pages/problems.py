@@ -9,7 +9,8 @@ from msgspec import Struct
 
 from mosaico_ingest.pages.recording import FAILED
 from mosaico_ingest.report.events import TopicStatus
-from mosaico_ingest.report.model import Report, RunReport, replay_command
+from mosaico_ingest.report.files import RunReport, replay_command
+from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.units import counted
 from mosaico_ingest.rules import RULES
 

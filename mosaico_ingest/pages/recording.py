@@ -17,7 +17,8 @@ from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, optiona
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
 from mosaico_ingest.report.contract import ExpectationResult, Outcome
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.model import Report, RunReport, TopicReport, folder_link, replay_command
+from mosaico_ingest.report.files import RunReport, replay_command
+from mosaico_ingest.report.model import Report, TopicReport, folder_link
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,

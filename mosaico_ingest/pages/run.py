@@ -20,7 +20,8 @@ from mosaico_ingest.pages.recording import (
 from mosaico_ingest.report.collect import slowest, step_seconds
 from mosaico_ingest.report.compare import Comparison
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.units import (
     bytes_text,
     count_text,

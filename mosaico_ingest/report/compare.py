@@ -8,7 +8,8 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.model import Report, RunReport, TopicReport
+from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.model import Report, TopicReport
 from mosaico_ingest.report.units import bytes_text, count_text, counted
 
 RATE_CHANGE = 0.05

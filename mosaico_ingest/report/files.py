@@ -1,4 +1,4 @@
-"""Report files: JSON documents, and JSON Lines to which a run appends each recording when it ends.
+"""The report of a run and its files: JSON documents, and JSON Lines to which a run appends each recording when it ends.
 
 A file in JSON Lines has a header, a line for each recording, and a summary. The lines of several runs follow each other if
 a run continues the report of an interrupted one; a recording then has the line of the last run that reported it.
@@ -6,26 +6,35 @@ a run continues the report of an interrupted one; a recording then has the line 
 
 from __future__ import annotations
 
+import shlex
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
+from datetime import datetime, timedelta
+from functools import cached_property, reduce
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from textwrap import indent
-from typing import IO, Any, Literal, TypeVar
+from typing import IO, Annotated, Any, Literal, TypeVar
 
 import msgspec
-from pydantic import BaseModel, ValidationError
+from pydantic import AfterValidator, BaseModel, Field, ValidationError, computed_field
 from typing_extensions import Self
 
-from mosaico_ingest.documents import read_document
+from mosaico_ingest.documents import document_schema, read_document
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.lazy import LazySequence, concatenate
+from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ReportPart
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
-from mosaico_ingest.report.model import Report, RunningSummary, RunReport, Summary, UsedManifest, summarize
+from mosaico_ingest.report.model import Report, Steps, topic_table
+from mosaico_ingest.report.units import count_text, counted
 
+_GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
+UNSUCCESSFUL = (RunStatus.FAILED, RunStatus.INTERRUPTED, RunStatus.DIVERTED)
+"""Statuses of recordings that were not stored as the job demands."""
+_SUMMED_TOTALS = ("read", "written", "filtered", "downsampled", "rejected", "stored_bytes")
 _fcntl: Any = import_module("fcntl") if find_spec("fcntl") else None
 """File locks; None on Windows."""
 LINES_SUFFIX = ".jsonl"
@@ -33,6 +42,138 @@ LINES_SUFFIX = ".jsonl"
 _HINT = "write one with `ingest run --report FILE`"
 _NO_RECORDINGS = '"recordings": []'
 _Model = TypeVar("_Model", bound=BaseModel)
+
+
+class UsedManifest(ReportPart):
+    """A manifest of the run, as it was at the start."""
+
+    path: str
+    text: str
+    """The manifest as YAML, with `extends` resolved and without secrets."""
+
+
+class Summary(ReportPart):
+    """Sums over the recordings of a run."""
+
+    statuses: Mapping[RunStatus, int] = Field(default={})
+    """Number of recordings by status."""
+    read: int = 0
+    written: int = 0
+    filtered: int = 0
+    downsampled: int = 0
+    rejected: int = 0
+    unreadable: int = 0
+    """Number of unreadable messages, as far as it is known."""
+    source_bytes: int = 0
+    stored_bytes: int = 0
+    duration_s: float = 0
+    """Time spent on recordings; recordings that run at the same time add up."""
+    steps: Steps = Steps()
+    started_at: datetime | None = None
+    """The time when the first recording started; None without recordings."""
+    ended_at: datetime | None = None
+    """The time when the last recording ended."""
+    exit_code: int = 0
+    """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
+    resumed: int = 0
+    """Number of recordings that an earlier run of the report finished and that the last run did not ingest again."""
+
+    def including(self, report: Report) -> Summary:
+        """Return the sums with another recording."""
+        totals = report.totals
+        ended_at = report.started_at + timedelta(seconds=report.duration_s)
+        return self.replace(
+            statuses={**self.statuses, report.status: self.statuses.get(report.status, 0) + 1},
+            **{name: getattr(self, name) + getattr(totals, name) for name in _SUMMED_TOTALS},
+            unreadable=self.unreadable + sum(item.count or 0 for item in report.unreadable_ranges),
+            source_bytes=self.source_bytes + report.source_bytes,
+            duration_s=round(self.duration_s + report.duration_s, 6),
+            steps=Steps(
+                **{name: round(getattr(self.steps, name) + seconds, 6) for name, seconds in report.steps}
+            ),
+            started_at=min(self.started_at or report.started_at, report.started_at),
+            ended_at=max(self.ended_at or ended_at, ended_at),
+            exit_code=gravest({self.exit_code, report.exit_code}),
+        )
+
+    @property
+    def recordings(self) -> int:
+        """Number of recordings."""
+        return sum(self.statuses.values())
+
+    @property
+    def headline(self) -> str:
+        """The numbers of recordings by outcome and of written messages, in one line."""
+        failed = sum(self.statuses.get(status, 0) for status in UNSUCCESSFUL)
+        skipped = self.statuses.get(RunStatus.SKIPPED, 0)
+        parts = [counted(self.recordings, "recording"), f"{count_text(failed)} failed"]
+        parts += [f"{count_text(self.resumed)} from earlier runs"] if self.resumed else []
+        parts += [f"{count_text(skipped)} skipped"] if skipped else []
+        return f"{', '.join(parts)}, {counted(self.written, 'message')} written"
+
+
+class RunReport(ReportPart):
+    """The report of one run, with a part for each recording; `version` changes with the format."""
+
+    version: Literal[1] = 1
+    tool: str
+    """Name and version of the program that wrote the report."""
+    manifests: tuple[UsedManifest, ...] = ()
+    recordings: Annotated[Sequence[Report], AfterValidator(tuple)]
+    """The result of each recording. If the report is a file in JSON Lines, each access reads the recording."""
+
+    @computed_field
+    @cached_property
+    def summary(self) -> Summary:
+        """The sums over all recordings."""
+        return summarize(self.recordings)
+
+    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
+        """Return a copy; the sums are computed again if the recordings differ."""
+        copy = super().model_copy(update=update, deep=deep)
+        if update is not None and "recordings" in update:
+            vars(copy).pop("summary", None)
+        return copy
+
+    def with_summary(self, summary: Summary) -> Self:
+        """Return the report with sums that were computed before."""
+        return self.model_copy(update={"summary": summary})
+
+    @property
+    def headline(self) -> str:
+        """The numbers of recordings by outcome and of written messages, in one line."""
+        return self.summary.headline
+
+    @computed_field
+    @property
+    def exit_code(self) -> int:
+        """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
+        return self.summary.exit_code
+
+    def __repr__(self) -> str:
+        """Return the outcome, such as `<RunReport: 2 recordings, 0 failed, 4,220 messages written>`."""
+        return f"<RunReport: {self.headline}>"
+
+    def _repr_html_(self) -> str:
+        """Return a table of the recordings for a notebook, or of the topics of a single recording."""
+        if len(self.recordings) == 1:
+            return topic_table(self.recordings[0])
+        rows = (
+            (
+                each.sequence,
+                each.status.value,
+                *(
+                    count_text(count)
+                    for count in (each.totals.read, each.totals.written, each.totals.rejected)
+                ),
+                each.error or "",
+            )
+            for each in self.recordings
+        )
+        names = ("sequence", "status", "read", "written", "rejected", "error")
+        return html_table(
+            self.headline, names, rows, count=len(self.recordings), numbers={"read", "written", "rejected"}
+        )
 
 
 class Header(ReportPart):
@@ -178,7 +319,7 @@ class ReportWriter:
                 f"the suffix of a report in JSON Lines is {LINES_SUFFIX}", where=str(path), hint="rename it"
             )
         self._index = _Index(path)
-        self._summary = RunningSummary()
+        self._summary = Summary()
         self._finished: set[int] = set()
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -219,7 +360,7 @@ class ReportWriter:
             return
         self._index.add(report.sequence, report.destination, report.exit_code)
         self._append(report)
-        self._summary.add(report)
+        self._summary = self._summary.including(report)
 
     def finish(self) -> RunReport:
         """Append the summary and return the report; each of its recordings is read from the file at each access.
@@ -228,7 +369,7 @@ class ReportWriter:
             SinkError: The file cannot be written.
         """
         resumed = self._index.resumed
-        summary = summarize(self._index.report().recordings) if resumed else self._summary.summary()
+        summary = summarize(self._index.report().recordings) if resumed else self._summary
         summary = summary.replace(resumed=resumed)
         self._append(Footer(summary=summary))
         self._index.summary = summary
@@ -262,6 +403,30 @@ class ReportWriter:
 
     def _unwritable(self, error: OSError) -> SinkError:
         return SinkError(f"cannot be written: {error.strerror}", where=str(self._index.path))
+
+
+def summarize(recordings: Iterable[Report]) -> Summary:
+    """Return the sums over recordings."""
+    return reduce(Summary.including, recordings, Summary())
+
+
+def gravest(codes: Collection[int]) -> int:
+    """Return the exit code of a run whose recordings have these exit codes."""
+    return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
+
+
+def report_schema() -> dict[str, Any]:
+    """Return the JSON Schema (draft 2020-12) of a report file."""
+    return document_schema(RunReport)
+
+
+def replay_command(report: RunReport, one: Report) -> str | None:
+    """Return the command that replays the quarantine of a recording; None if it has none."""
+    if one.quarantine is None:
+        return None
+    manifests = [manifest.path for manifest in report.manifests]
+    job = shlex.quote(manifests[0]) if len(manifests) == 1 else "JOB.yaml"
+    return f"ingest replay {shlex.quote(str(Path(one.quarantine).parent))} --manifest {job}"
 
 
 def read_report(path: Path) -> RunReport:

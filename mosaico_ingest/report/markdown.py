@@ -8,7 +8,8 @@ from mosaico_ingest.findings import Severity, one_line
 from mosaico_ingest.report.collect import STEP_WORDS, longest_step, slowest, step_seconds
 from mosaico_ingest.report.compare import Comparison
 from mosaico_ingest.report.contract import ExpectationResult, Outcome
-from mosaico_ingest.report.model import Report, RunReport, replay_command
+from mosaico_ingest.report.files import RunReport, replay_command
+from mosaico_ingest.report.model import Report
 from mosaico_ingest.report.units import bytes_text, count_text, counted, percent_text, seconds_text
 
 MAX_SLOWEST = 3

@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.report.contract import ContractResult, Outcome
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.model import RunReport
+from mosaico_ingest.report.files import RunReport
 from mosaico_ingest.report.timing import Step
 
 _PREFIX = "mosaico_ingest"

@@ -3,30 +3,19 @@
 from __future__ import annotations
 
 import os
-import shlex
-from collections import Counter
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import datetime, timedelta
-from functools import cached_property
+from collections.abc import Mapping
+from datetime import datetime
 from pathlib import Path
-from typing import Annotated, Any, Literal
 from urllib.parse import quote
 
-from pydantic import AfterValidator, Field, computed_field
-from typing_extensions import Self
+from pydantic import computed_field
 
-from mosaico_ingest.documents import document_schema
 from mosaico_ingest.findings import Finding, Severity, Stage, one_line
 from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ContractResult, Location, ReportPart
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, written_cell, written_text
-
-_GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
-UNSUCCESSFUL = (RunStatus.FAILED, RunStatus.INTERRUPTED, RunStatus.DIVERTED)
-"""Statuses of recordings that were not stored as the job demands."""
 
 
 class Stretch(ReportPart):
@@ -268,7 +257,7 @@ class Report(ReportPart):
 
     def _repr_html_(self) -> str:
         """Return a table of the topics for a notebook."""
-        return _topic_table(self)
+        return topic_table(self)
 
     @computed_field
     @property
@@ -277,170 +266,7 @@ class Report(ReportPart):
         return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
 
 
-class UsedManifest(ReportPart):
-    """A manifest of the run, as it was at the start."""
-
-    path: str
-    text: str
-    """The manifest as YAML, with `extends` resolved and without secrets."""
-
-
-class Summary(ReportPart):
-    """Sums over the recordings of a run."""
-
-    statuses: Mapping[RunStatus, int] = Field(default={})
-    """Number of recordings by status."""
-    read: int = 0
-    written: int = 0
-    filtered: int = 0
-    downsampled: int = 0
-    rejected: int = 0
-    unreadable: int = 0
-    """Number of unreadable messages, as far as it is known."""
-    source_bytes: int = 0
-    stored_bytes: int = 0
-    duration_s: float = 0
-    """Time spent on recordings; recordings that run at the same time add up."""
-    steps: Steps = Steps()
-    started_at: datetime | None = None
-    """The time when the first recording started; None without recordings."""
-    ended_at: datetime | None = None
-    """The time when the last recording ended."""
-    exit_code: int = 0
-    """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
-    resumed: int = 0
-    """Number of recordings that an earlier run of the report finished and that the last run did not ingest again."""
-
-    @property
-    def recordings(self) -> int:
-        """Number of recordings."""
-        return sum(self.statuses.values())
-
-    @property
-    def headline(self) -> str:
-        """The numbers of recordings by outcome and of written messages, in one line."""
-        failed = sum(self.statuses.get(status, 0) for status in UNSUCCESSFUL)
-        skipped = self.statuses.get(RunStatus.SKIPPED, 0)
-        parts = [counted(self.recordings, "recording"), f"{count_text(failed)} failed"]
-        parts += [f"{count_text(self.resumed)} from earlier runs"] if self.resumed else []
-        parts += [f"{count_text(skipped)} skipped"] if skipped else []
-        return f"{', '.join(parts)}, {counted(self.written, 'message')} written"
-
-
-@dataclass(slots=True)
-class RunningSummary:
-    """The sums over the recordings that have ended so far."""
-
-    _statuses: Counter[RunStatus] = field(default_factory=Counter[RunStatus])
-    _counts: Counter[str] = field(default_factory=Counter[str])
-    _seconds: dict[str, float] = field(default_factory=lambda: dict.fromkeys(Steps.model_fields, 0.0))
-    _duration_s: float = 0
-    _codes: set[int] = field(default_factory=set[int])
-    _started_at: datetime | None = None
-    _ended_at: datetime | None = None
-
-    def add(self, report: Report) -> None:
-        """Add the report of a recording."""
-        totals = report.totals
-        self._statuses[report.status] += 1
-        self._codes.add(report.exit_code)
-        for name in ("read", "written", "filtered", "downsampled", "rejected", "stored_bytes"):
-            self._counts[name] += getattr(totals, name)
-        self._counts["unreadable"] += sum(item.count or 0 for item in report.unreadable_ranges)
-        self._counts["source_bytes"] += report.source_bytes
-        for name in self._seconds:
-            self._seconds[name] += getattr(report.steps, name)
-        self._duration_s += report.duration_s
-        ended_at = report.started_at + timedelta(seconds=report.duration_s)
-        self._started_at = min(self._started_at or report.started_at, report.started_at)
-        self._ended_at = max(self._ended_at or ended_at, ended_at)
-
-    def summary(self) -> Summary:
-        """Return the sums so far."""
-        return Summary(
-            statuses=dict(self._statuses),
-            **self._counts,
-            duration_s=round(self._duration_s, 6),
-            steps=Steps(**{name: round(seconds, 6) for name, seconds in self._seconds.items()}),
-            started_at=self._started_at,
-            ended_at=self._ended_at,
-            exit_code=gravest(self._codes),
-        )
-
-
-def summarize(recordings: Iterable[Report]) -> Summary:
-    """Return the sums over recordings."""
-    running = RunningSummary()
-    for recording in recordings:
-        running.add(recording)
-    return running.summary()
-
-
-class RunReport(ReportPart):
-    """The report of one run, with a part for each recording; `version` changes with the format."""
-
-    version: Literal[1] = 1
-    tool: str
-    """Name and version of the program that wrote the report."""
-    manifests: tuple[UsedManifest, ...] = ()
-    recordings: Annotated[Sequence[Report], AfterValidator(tuple)]
-    """The result of each recording. If the report is a file in JSON Lines, each access reads the recording."""
-
-    @computed_field
-    @cached_property
-    def summary(self) -> Summary:
-        """The sums over all recordings."""
-        return summarize(self.recordings)
-
-    def model_copy(self, *, update: Mapping[str, Any] | None = None, deep: bool = False) -> Self:
-        """Return a copy; the sums are computed again if the recordings differ."""
-        copy = super().model_copy(update=update, deep=deep)
-        if update is not None and "recordings" in update:
-            vars(copy).pop("summary", None)
-        return copy
-
-    def with_summary(self, summary: Summary) -> Self:
-        """Return the report with sums that were computed before."""
-        return self.model_copy(update={"summary": summary})
-
-    @property
-    def headline(self) -> str:
-        """The numbers of recordings by outcome and of written messages, in one line."""
-        return self.summary.headline
-
-    @computed_field
-    @property
-    def exit_code(self) -> int:
-        """The first of 130, 5, 1, 2, 6, 3, 4, 0 that any recording produced."""
-        return self.summary.exit_code
-
-    def __repr__(self) -> str:
-        """Return the outcome, such as `<RunReport: 2 recordings, 0 failed, 4,220 messages written>`."""
-        return f"<RunReport: {self.headline}>"
-
-    def _repr_html_(self) -> str:
-        """Return a table of the recordings for a notebook, or of the topics of a single recording."""
-        if len(self.recordings) == 1:
-            return _topic_table(self.recordings[0])
-        rows = (
-            (
-                each.sequence,
-                each.status.value,
-                *(
-                    count_text(count)
-                    for count in (each.totals.read, each.totals.written, each.totals.rejected)
-                ),
-                each.error or "",
-            )
-            for each in self.recordings
-        )
-        names = ("sequence", "status", "read", "written", "rejected", "error")
-        return html_table(
-            self.headline, names, rows, count=len(self.recordings), numbers={"read", "written", "rejected"}
-        )
-
-
-def _topic_table(report: Report) -> str:
+def topic_table(report: Report) -> str:
     """Return the topics that were read as a table for a notebook."""
     topics = [topic for topic in report.topics if topic.status is not TopicStatus.EXCLUDED]
     excluded = len(report.topics) - len(topics)
@@ -458,25 +284,6 @@ def _topic_table(report: Report) -> str:
     names = ("topic", "ontology", "read", "written", "rejected", "stored")
     notes = [*([f"excluded: {counted(excluded, 'topic')}"] if excluded else []), *report.findings]
     return html_table(repr(report)[1:-1], names, rows, count=len(topics), numbers=names[2:], notes=notes)
-
-
-def gravest(codes: Collection[int]) -> int:
-    """Return the exit code of a run whose recordings have these exit codes."""
-    return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
-
-
-def report_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a report file."""
-    return document_schema(RunReport)
-
-
-def replay_command(report: RunReport, one: Report) -> str | None:
-    """Return the command that replays the quarantine of a recording; None if it has none."""
-    if one.quarantine is None:
-        return None
-    manifests = [manifest.path for manifest in report.manifests]
-    job = shlex.quote(manifests[0]) if len(manifests) == 1 else "JOB.yaml"
-    return f"ingest replay {shlex.quote(str(Path(one.quarantine).parent))} --manifest {job}"
 
 
 def folder_link(one: Report, page_folder: Path) -> str | None:

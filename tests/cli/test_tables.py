@@ -17,7 +17,8 @@ from mosaico_ingest.findings import Stage
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.model import Rejection, Report, RunReport, TopicReport
+from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.model import Rejection, Report, TopicReport
 from mosaico_ingest.report.units import rate_text, written_text
 from mosaico_ingest.services.draft import draft_manifest
 from mosaico_ingest.services.inspection import estimate_rate_hz

@@ -24,7 +24,8 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.model import Report
 
 IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
 LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, excluded=True)

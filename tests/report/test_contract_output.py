@@ -7,9 +7,10 @@ from datetime import datetime, timezone
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Location, Outcome
 from mosaico_ingest.report.events import RunStatus
+from mosaico_ingest.report.files import RunReport
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.metrics import contract_metrics, prometheus_text
-from mosaico_ingest.report.model import Report, RunReport
+from mosaico_ingest.report.model import Report
 
 LOCATION = Location(file="job.yaml", line=7, column=5, end_line=7, end_column=9)
 

@@ -11,16 +11,8 @@ from html.parser import HTMLParser
 
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.model import (
-    Rejection,
-    Report,
-    RunReport,
-    Steps,
-    Stretch,
-    TopicReport,
-    UnreadableRange,
-    UsedManifest,
-)
+from mosaico_ingest.report.files import RunReport, UsedManifest
+from mosaico_ingest.report.model import Rejection, Report, Steps, Stretch, TopicReport, UnreadableRange
 from mosaico_ingest.report.timing import TimelineReport
 
 VOID = {"meta", "link", "input", "path", "img", "br"}
