@@ -162,7 +162,7 @@ def quick_config(
         ManifestError: An option has an invalid value.
     """
     if sequence_name is None:
-        from mosaico_ingest.services.draft import default_name
+        from mosaico_ingest.services.inspection import default_name
 
         sequence_name = default_name(as_path(path) if isinstance(path, str) else path)
     return ROSInjectionConfig(

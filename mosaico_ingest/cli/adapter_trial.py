@@ -10,7 +10,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
 from mosaico_ingest.report.units import counted, time_text
-from mosaico_ingest.services.adapter_trial import TriedMessage
+from mosaico_ingest.services.adapters import TriedMessage
 
 _MAX_ITEMS = 4
 """Number of elements of a list that are shown."""

@@ -191,7 +191,7 @@ def try_messages(
     from msgspec import to_builtins
 
     from mosaico_ingest.cli.adapter_trial import print_trial
-    from mosaico_ingest.services.adapter_trial import try_adapter
+    from mosaico_ingest.services.adapters import try_adapter
 
     spec = _find(adapter)
     types = _definition_finder(distro, msg_dirs)

@@ -24,7 +24,7 @@ def list_types(
     from msgspec import to_builtins
 
     from mosaico_ingest.errors import NothingMatched
-    from mosaico_ingest.services.ontology import known_ontologies
+    from mosaico_ingest.services.schemas import known_ontologies
 
     types = known_ontologies(tag)
     if not types:
@@ -48,7 +48,7 @@ def show(
     """Show the fields of an ontology type with their types, units, and whether they can be null."""
     from msgspec import to_builtins
 
-    from mosaico_ingest.services.ontology import describe_ontology
+    from mosaico_ingest.services.schemas import describe_ontology
 
     described = describe_ontology(tag)
     if as_json:

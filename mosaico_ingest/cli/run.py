@@ -308,7 +308,7 @@ def replay(
     from mosaico_ingest.cli.console import print_line
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.services.replay import ReplayState, find_replays, lock_quarantine
+    from mosaico_ingest.services.status import ReplayState, find_replays, lock_quarantine
 
     def mark_replayed(result: RunReport) -> None:
         for entry, recording in zip(waiting, result.recordings, strict=False):

@@ -104,7 +104,7 @@ def lock(
     if manifest is None:
         write_schemas([Document.LOCK], None, None)
         return
-    from mosaico_ingest.services.lock import check_locked, write_lock
+    from mosaico_ingest.services.schemas import check_locked, write_lock
 
     collect_garbage_as_usual()
     jobs = api.compile_job(manifest, locked=False)
@@ -165,7 +165,7 @@ def _schema_text(document: Document) -> str:
     from mosaico_ingest.pipeline.definition_lock import lock_schema
     from mosaico_ingest.pipeline.plan_document import plan_schema
     from mosaico_ingest.report.files import report_schema
-    from mosaico_ingest.services.editor_schema import adapter_editor_schema, job_editor_schema
+    from mosaico_ingest.services.schemas import adapter_editor_schema, job_editor_schema
 
     schemas: dict[Document, Callable[[], dict[str, Any]]] = {
         Document.JOB: job_editor_schema,

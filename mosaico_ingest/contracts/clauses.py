@@ -1,9 +1,10 @@
-"""The clauses of a contract: each expectation of a job with its key path, severity and location."""
+"""The clauses of a contract: each expectation of a job with its key path, severity and location, and the texts of results."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from fnmatch import fnmatchcase
+from math import isfinite
 from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
@@ -15,12 +16,17 @@ from mosaico_ingest.job.expect import (
     Expectations,
     ExpectedTopic,
     FieldExpectations,
-    Limit,
     StampOrder,
     TopicExpectations,
 )
+from mosaico_ingest.job.expect import (
+    Limit as LimitExpectation,
+)
 from mosaico_ingest.job.model import Job
+from mosaico_ingest.job.units import format_time
+from mosaico_ingest.job.values import Limit, TimeBound
 from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
+from mosaico_ingest.report.units import count_text
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 if TYPE_CHECKING:
@@ -38,6 +44,17 @@ ORDER_KEYS = frozenset({"out_of_order", "sequence_numbers"})
 
 _LISTS = {"type": AllowedNames, "frame_id": AllowedNames}
 _LIMITS = frozenset({"rejected", "out_of_order", "unreadable"})
+
+
+_UNITS = (
+    (3_600_000_000_000, "h"),
+    (60_000_000_000, "min"),
+    (1_000_000_000, "s"),
+    (1_000_000, "ms"),
+    (1_000, "us"),
+)
+_SHORT_NS = 120_000_000_000
+"""Durations below two minutes are shown in seconds or smaller units."""
 
 
 class ReadTopic(Struct, frozen=True):
@@ -191,7 +208,7 @@ def _full_form(key: str, value: Any) -> Any:  # noqa: ANN401 - any form of an ex
     if isinstance(value, Expectation):
         return value
     if key in _LIMITS:
-        return Limit(max=value)
+        return LimitExpectation(max=value)
     if key in _LISTS:
         return AllowedNames(one_of=(value,) if isinstance(value, str) else tuple(value))
     if key == "stamps":
@@ -214,3 +231,80 @@ def occurrence(
     if isinstance(value, float) and value - value != 0:
         value = repr(value)
     return Occurrence(log_time_ns=log_time_ns, index=index, value=value)
+
+
+def duration_text(ns: float) -> str:
+    """Return a duration in a suitable unit, such as `50 ms` or `1.5 h`."""
+    size = abs(ns)
+    if size < _SHORT_NS:
+        unit, name = next(((unit, name) for unit, name in _UNITS[2:] if size >= unit), (1, "ns"))
+    else:
+        unit, name = next((unit, name) for unit, name in _UNITS if size >= unit)
+    return f"{number_text(ns / unit)} {name}"
+
+
+def number_text(value: float) -> str:
+    """Return a number with at most six significant digits and thousands separators for whole numbers."""
+    if isfinite(value) and abs(value) < 1e15 and value == int(value):  # noqa: PLR2004 - exact
+        return count_text(int(value))
+    return f"{value:.6g}"
+
+
+def share_text(value: float) -> str:
+    """Return a share as a percentage, such as `0.15%`."""
+    return f"{100 * value:.4g}%"
+
+
+def instant_text(ns: int) -> str:
+    """Return an instant in ISO 8601."""
+    try:
+        return format_time(TimeBound(ns))
+    except (OverflowError, ValueError, OSError):
+        return f"{ns} ns"
+
+
+def part_text(limit: Limit, count: int, total: int, what: str) -> str:
+    """Return the part of a total that a limit applies to, such as `3 of 20 messages were rejected (15%)`."""
+    percentage = f" ({share_text(count / total)})" if limit.count is None and total else ""
+    return f"{count_text(count)} of {count_text(total)} {what}{percentage}"
+
+
+def limit_text(limit: Limit) -> str:
+    """Return a maximum number or share of messages."""
+    return (
+        f"at most {count_text(limit.count)}"
+        if limit.count is not None
+        else f"at most {share_text(limit.share or 0)}"
+    )
+
+
+def bounds_text(low: str | None, high: str | None) -> str:
+    """Return a range such as `from 95 Hz to 105 Hz`, `at least 95 Hz` or `at most 105 Hz`."""
+    if low is not None and high is not None:
+        return f"from {low} to {high}"
+    return f"at least {low}" if low is not None else f"at most {high}"
+
+
+def position_text(where: Occurrence) -> str:
+    """Return the position of an occurrence, such as `2026-01-01T00:00:04.1Z (message 410)`."""
+    time = "" if where.log_time_ns is None else instant_text(where.log_time_ns)
+    index = "" if where.index is None else f"message {count_text(where.index)}"
+    return f"{time} ({index})" if time and index else time or index
+
+
+def extremes_text(first: Occurrence | None, worst: Occurrence | None) -> str:
+    """Return where the first and the worst violation are, to be appended to a text."""
+    if worst is None or (worst.log_time_ns is None and worst.index is None):
+        return ""
+    if first is None or (first.log_time_ns, first.index) == (worst.log_time_ns, worst.index):
+        return f"; at {position_text(worst)}"
+    return f"; first at {position_text(first)}, worst at {position_text(worst)}"
+
+
+def value_text(data: Any) -> str:  # noqa: ANN401 - any value of an occurrence
+    """Return a value of a message."""
+    if data is None:
+        return "null"
+    if isinstance(data, bool):
+        return "true" if data else "false"
+    return number_text(data) if isinstance(data, int | float) else repr(data)

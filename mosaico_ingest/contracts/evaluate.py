@@ -1,26 +1,40 @@
-"""The results of a contract, from what the monitors observed and from the index of the recording."""
+"""The results of a contract: from what the monitors observed, from the index, and from the recordings of a group."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from fnmatch import fnmatchcase
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from msgspec import Struct
 
-from mosaico_ingest.contracts import texts
-from mosaico_ingest.contracts.clauses import HEADER_KEYS, Clause, Contract, occurrence, other_types
-from mosaico_ingest.contracts.monitor import TopicMonitor
-from mosaico_ingest.contracts.order import FileOrder
-from mosaico_ingest.contracts.recorder import RecorderEvents, Windows, covered_ns, uncovered_ns
+from mosaico_ingest.contracts.clauses import (
+    HEADER_KEYS,
+    Clause,
+    Contract,
+    bounds_text,
+    duration_text,
+    extremes_text,
+    instant_text,
+    limit_text,
+    number_text,
+    occurrence,
+    other_types,
+    part_text,
+    share_text,
+)
 from mosaico_ingest.contracts.row_results import field_result, header_result
-from mosaico_ingest.contracts.times import Gaps
+from mosaico_ingest.contracts.times import FileOrder, Gaps, RecorderEvents, Windows, covered_ns, uncovered_ns
 from mosaico_ingest.job.values import RECORDING, Limit
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import count_text, counted
+
+if TYPE_CHECKING:
+    from mosaico_ingest.contracts.monitor import TopicMonitor
 
 
 class TopicFacts:
@@ -118,21 +132,21 @@ def _recording_result(clause: Clause, facts: Facts) -> ExpectationResult:
         return clause.failed("the recording has no message")
     if clause.key == "duration":
         length = facts.end_ns - facts.start_ns
-        limit = texts.bounds(_or_none(texts.duration, expected.min), _or_none(texts.duration, expected.max))
+        limit = bounds_text(_or_none(duration_text, expected.min), _or_none(duration_text, expected.max))
         is_good = _within(length, expected.min, expected.max)
-        text = f"the recording lasts {texts.duration(length)}; expected {limit}"
+        text = f"the recording lasts {duration_text(length)}; expected {limit}"
         return _result(clause, is_good, text, measured=length, unit="ns", limit=limit)
     moment = facts.start_ns if clause.key == "start" else facts.end_ns
     is_good = (expected.after is None or moment >= expected.after) and (
         expected.before is None or moment < expected.before
     )
     limit = " and ".join(
-        f"{name} {texts.instant(bound)}"
+        f"{name} {instant_text(bound)}"
         for name, bound in (("not before", expected.after), ("before", expected.before))
         if bound is not None
     )
     verb = "starts" if clause.key == "start" else "ends"
-    text = f"the recording {verb} at {texts.instant(moment)}; expected {limit}"
+    text = f"the recording {verb} at {instant_text(moment)}; expected {limit}"
     return _result(clause, is_good, text, measured=moment, unit="ns", limit=limit)
 
 
@@ -209,7 +223,7 @@ def _count_result(clause: Clause, count: int | None, subject: str) -> Expectatio
     if count is None:
         return clause.skipped("the index does not count the messages")
     expected = clause.expected
-    limit = texts.bounds(_or_none(count_text, expected.min), _or_none(count_text, expected.max))
+    limit = bounds_text(_or_none(count_text, expected.min), _or_none(count_text, expected.max))
     text = f"{subject} {counted(count, 'message')}; expected {limit}"
     is_good = _within(count, expected.min, expected.max)
     return _result(clause, is_good, text, measured=count, unit="messages", limit=limit)
@@ -231,9 +245,9 @@ def limit_result(
 ) -> ExpectationResult:
     """Return the result of an expectation that limits a number or share of messages."""
     is_good = limit.allows(count, total)
-    text = f"{texts.part(limit, count, total, what)}; expected {texts.limit(limit)}"
+    text = f"{part_text(limit, count, total, what)}; expected {limit_text(limit)}"
     unit = "messages" if limit.share is None else "share"
-    details = {"measured": limit.measure(count, total), "unit": unit, "limit": texts.limit(limit), **details}
+    details = {"measured": limit.measure(count, total), "unit": unit, "limit": limit_text(limit), **details}
     return _result(clause, is_good, text, violations=0 if is_good else count, **details)
 
 
@@ -248,7 +262,7 @@ def _out_of_order(clause: Clause, topic: TopicFacts, facts: Facts) -> Expectatio
     where = None if worst is None else occurrence(worst.log_time_ns, None, worst.size)
     begin = None if first is None else occurrence(first.log_time_ns, None, first.size)
     what = "messages have an earlier log time than the message before them"
-    back = f", the largest step back is {texts.duration(worst.size)}" if worst else ""
+    back = f", the largest step back is {duration_text(worst.size)}" if worst else ""
     return limit_result(clause, clause.expected.max, count, total, what + back, first=begin, worst=where)
 
 
@@ -293,8 +307,8 @@ def _too_few(clause: Clause, count: int) -> ExpectationResult:
 
 def _rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
     times, expected = monitor.times, clause.expected
-    limit = texts.bounds(
-        *(None if hz is None else f"{texts.number(hz)} Hz" for hz in (expected.min, expected.max))
+    limit = bounds_text(
+        *(None if hz is None else f"{number_text(hz)} Hz" for hz in (expected.min, expected.max))
     )
     if times.count < 2 or times.first_ns is None or times.last_ns is None:  # noqa: PLR2004 - a rate needs an interval
         return _too_few(clause, times.count)
@@ -302,37 +316,37 @@ def _rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationRes
     if rate is None:
         return clause.failed(f"all of {counted(times.count, 'message')} have one log time", limit=limit)
     if _within(rate, expected.min, expected.max):
-        text = f"the mean rate is {texts.number(rate)} Hz; expected {limit}"
+        text = f"the mean rate is {number_text(rate)} Hz; expected {limit}"
         return clause.passed(text, measured=rate, unit="Hz", limit=limit)
     paused = covered_ns(times.first_ns, times.last_ns, facts.events.windows_of(monitor.name))
     active_rate = mean_rate_hz(times.count, times.first_ns, times.last_ns - paused)
     if paused and active_rate is not None:
         rate = active_rate
-        note = f" without {texts.duration(paused)} in which the recorder was paused"
+        note = f" without {duration_text(paused)} in which the recorder was paused"
     else:
         note = ""
     is_good = _within(rate, expected.min, expected.max)
-    text = f"the mean rate is {texts.number(rate)} Hz{note}; expected {limit}"
+    text = f"the mean rate is {number_text(rate)} Hz{note}; expected {limit}"
     return _result(clause, is_good, text, measured=rate, unit="Hz", limit=limit, explained=int(is_good))
 
 
 def _sliding_rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:  # noqa: ARG001 - the signature of all
     window, expected = monitor.times.windows[clause.key], clause.expected
     seconds = expected.window / 1e9
-    limit = texts.bounds(
-        *(None if hz is None else f"{texts.number(hz)} Hz" for hz in (expected.min, expected.max))
+    limit = bounds_text(
+        *(None if hz is None else f"{number_text(hz)} Hz" for hz in (expected.min, expected.max))
     )
     if window.lowest is None or window.highest is None:
-        span = texts.duration(monitor.times.span_ns)
+        span = duration_text(monitor.times.span_ns)
         return clause.skipped(
-            f"the topic lasts {span}, less than a window of {texts.duration(expected.window)}"
+            f"the topic lasts {span}, less than a window of {duration_text(expected.window)}"
         )
     low, high = window.lowest.count / seconds, window.highest.count / seconds
     too_low = expected.min is not None and low < expected.min - 1e-9 / seconds
     too_high = expected.max is not None and high > expected.max + 1e-9 / seconds
     text = (
-        f"the rate in windows of {texts.duration(expected.window)} is from {texts.number(low)} Hz to "
-        f"{texts.number(high)} Hz; expected {limit}"
+        f"the rate in windows of {duration_text(expected.window)} is from {number_text(low)} Hz to "
+        f"{number_text(high)} Hz; expected {limit}"
     )
     extreme = window.lowest if too_low else window.highest
     measured = low if too_low else high
@@ -343,7 +357,7 @@ def _sliding_rate(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expect
     first = None
     if window.first is not None:
         first = occurrence(window.first.start_ns, window.first.index, window.first.count / seconds)
-    text += texts.extremes(first, worst)
+    text += extremes_text(first, worst)
     return clause.failed(text, violations=window.violations, first=first, worst=worst, **details)
 
 
@@ -358,17 +372,17 @@ def _unexplained(gaps: Gaps, name: str, facts: Facts, limit_ns: int) -> tuple[np
 def _gap(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
     gaps, longest = monitor.times.gaps[clause.key], monitor.times.longest
     limit_ns = clause.expected.max
-    limit = f"at most {texts.duration(limit_ns)}"
+    limit = f"at most {duration_text(limit_ns)}"
     unexplained, _ = _unexplained(gaps, monitor.name, facts, limit_ns)
     explained = len(unexplained) - int(unexplained.sum())
     if not unexplained.any():
         if explained:
-            text = f"{counted(explained, 'gap')} longer than {texts.duration(limit_ns)}, while the recorder was paused"
+            text = f"{counted(explained, 'gap')} longer than {duration_text(limit_ns)}, while the recorder was paused"
             return clause.passed(
                 text, measured=int(gaps.lengths.max()), unit="ns", limit=limit, explained=explained
             )
         length = 0 if longest is None else longest.length_ns
-        text = f"the longest gap is {texts.duration(length)}; expected {limit}"
+        text = f"the longest gap is {duration_text(length)}; expected {limit}"
         return clause.passed(text, measured=length, unit="ns", limit=limit)
     positions = np.flatnonzero(unexplained)
     first = gaps.at(int(positions[0]))
@@ -376,7 +390,7 @@ def _gap(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResu
     where = occurrence(worst.end_ns, worst.index, worst.length_ns)
     begin = occurrence(first.end_ns, first.index, first.length_ns)
     many = f" ({count_text(len(positions))} gaps are longer)" if len(positions) > 1 else ""
-    text = f"the longest gap is {texts.duration(worst.length_ns)}; expected {limit}{many}{texts.extremes(begin, where)}"
+    text = f"the longest gap is {duration_text(worst.length_ns)}; expected {limit}{many}{extremes_text(begin, where)}"
     return clause.failed(
         text,
         measured=worst.length_ns,
@@ -392,13 +406,13 @@ def _gap(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResu
 def _gap_share(clause: Clause, monitor: TopicMonitor, facts: Facts) -> ExpectationResult:
     gaps, expected = monitor.times.gaps[clause.key], clause.expected
     limit_ns = gaps.limit_ns or 0
-    limit = f"at most {texts.share(expected.max_share)}"
+    limit = f"at most {share_text(expected.max_share)}"
     unexplained, _ = _unexplained(gaps, monitor.name, facts, limit_ns)
     positions = np.flatnonzero(unexplained)
     share = len(positions) / gaps.total
     text = (
-        f"{count_text(len(positions))} of {count_text(gaps.total)} intervals ({texts.share(share)}) are longer than "
-        f"{texts.duration(limit_ns)}; expected {limit}"
+        f"{count_text(len(positions))} of {count_text(gaps.total)} intervals ({share_text(share)}) are longer than "
+        f"{duration_text(limit_ns)}; expected {limit}"
     )
     details: dict[str, Any] = {"measured": share, "unit": "share", "limit": limit}
     details["explained"] = len(unexplained) - len(positions)
@@ -408,7 +422,7 @@ def _gap_share(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectati
     worst = gaps.at(int(positions[int(gaps.lengths[positions].argmax())]))
     begin = occurrence(first.end_ns, first.index, first.length_ns)
     where = occurrence(worst.end_ns, worst.index, worst.length_ns)
-    text += f"; the longest is {texts.duration(worst.length_ns)}{texts.extremes(begin, where)}"
+    text += f"; the longest is {duration_text(worst.length_ns)}{extremes_text(begin, where)}"
     return clause.failed(text, violations=len(positions), first=begin, worst=where, **details)
 
 
@@ -416,7 +430,7 @@ def _coverage(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectatio
     times, expected = monitor.times, clause.expected
     subject = "the recording" if expected.of == RECORDING else expected.of
     span = facts.span_of(expected.of)
-    limit = f"at least {texts.share(expected.min)}"
+    limit = f"at least {share_text(expected.min)}"
     if span is None:
         return clause.failed(f"{subject} has no message, so its coverage is unknown", limit=limit)
     start, end = span
@@ -436,7 +450,7 @@ def _coverage(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectatio
     explained = int(((lengths > limit_ns) & ~missing).sum())
     total = end - start
     share = 1.0 if not total else 1 - int(lengths[missing].sum()) / total
-    text = f"the topic covers {texts.share(share)} of {subject}; expected {limit}"
+    text = f"the topic covers {share_text(share)} of {subject}; expected {limit}"
     details: dict[str, Any] = {"measured": share, "unit": "share", "limit": limit, "explained": explained}
     if share >= expected.min:
         return clause.passed(text, **details)
@@ -445,8 +459,8 @@ def _coverage(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectatio
     first = occurrence(int(ends[positions[0]]), None, int(lengths[positions[0]]))
     worst = occurrence(int(ends[most]), None, int(lengths[most]))
     text += (
-        f"; the longest interval without messages is {texts.duration(int(lengths[most]))}, "
-        f"until {texts.instant(int(ends[most]))}"
+        f"; the longest interval without messages is {duration_text(int(lengths[most]))}, "
+        f"until {instant_text(int(ends[most]))}"
     )
     return clause.failed(text, violations=len(positions), first=first, worst=worst, **details)
 
@@ -455,7 +469,7 @@ def _proximity(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectati
     expected, key = clause.expected, clause.key
     subject = "the recording" if expected.of == RECORDING else expected.of
     span, times = facts.span_of(expected.of), monitor.times
-    limit = f"at most {texts.duration(expected.within)}"
+    limit = f"at most {duration_text(expected.within)}"
     if span is None:
         return clause.failed(f"{subject} has no message to compare the {key} with", limit=limit)
     if times.first_ns is None or times.last_ns is None:
@@ -464,7 +478,7 @@ def _proximity(clause: Clause, monitor: TopicMonitor, facts: Facts) -> Expectati
     distance = own - other
     side = "after" if distance >= 0 else "before"
     verb = "starts" if key == "start" else "ends"
-    text = f"the topic {verb} {texts.duration(abs(distance))} {side} the {key} of {subject}; expected {limit}"
+    text = f"the topic {verb} {duration_text(abs(distance))} {side} the {key} of {subject}; expected {limit}"
     details: dict[str, Any] = {"measured": distance, "unit": "ns", "limit": limit}
     if abs(distance) <= expected.within:
         return clause.passed(text, **details)
@@ -501,4 +515,87 @@ def _result(clause: Clause, is_good: bool, text: str, **details: Any) -> Expecta
         details.pop("first", None)
         details.pop("worst", None)
         return clause.passed(text, **details)
-    return clause.failed(text + texts.extremes(details.get("first"), details.get("worst")), **details)
+    return clause.failed(text + extremes_text(details.get("first"), details.get("worst")), **details)
+
+
+class Member(Struct, frozen=True):
+    """A recording of a group; the times are None if it has no message or cannot be opened."""
+
+    names: tuple[str, ...]
+    """The names of its files, and of its folder if it is one."""
+    start_ns: int | None = None
+    end_ns: int | None = None
+
+
+def group_results(contract: Contract, members: Sequence[Member]) -> tuple[ExpectationResult, ...]:
+    """Return the results of `expect.group` for the recordings of one group."""
+    return tuple(_group_result(clause, members) for clause in contract.group_clauses())
+
+
+def _group_result(clause: Clause, members: Sequence[Member]) -> ExpectationResult:
+    if clause.key in {"starts", "ends"}:
+        return _group_distance(clause, members)
+    return _group_gap(clause, members) if clause.key == "gap" else _group_file(clause, members)
+
+
+def _group_file(clause: Clause, members: Sequence[Member]) -> ExpectationResult:
+    pattern = clause.expected
+    names = [name for member in members for name in member.names]
+    count = sum(any(fnmatchcase(name, pattern) for name in member.names) for member in members)
+    if count:
+        text = f"{pattern!r} matches {counted(count, 'recording')}"
+        return clause.passed(text, measured=count, unit="recordings", limit="at least 1 recording")
+    near = get_close_matches(pattern, names, n=1, cutoff=0.4)
+    nearest = f"; the nearest is {near[0]}" if near else ""
+    text = f"no file for {pattern!r} among {counted(len(members), 'recording')}{nearest}"
+    return clause.failed(text, measured=0, unit="recordings", limit="at least 1 recording")
+
+
+def _group_distance(clause: Clause, members: Sequence[Member]) -> ExpectationResult:
+    times = [
+        (time, member.names[0])
+        for member in members
+        if (time := member.start_ns if clause.key == "starts" else member.end_ns) is not None
+    ]
+    absent = [member.names[0] for member in members if member.start_ns is None]
+    limit = f"at most {duration_text(clause.expected.within)}"
+    if absent:
+        return clause.failed(f"{absent[0]} has no message, so it has no start and no end", limit=limit)
+    if not times:
+        return clause.skipped("the group has no recording")
+    (first, early), (last, late) = min(times), max(times)
+    distance = last - first
+    verb = "starts" if clause.key == "starts" else "ends"
+    text = f"{late} {verb} {duration_text(distance)} after {early}; expected {limit}"
+    if distance <= clause.expected.within:
+        return clause.passed(text, measured=distance, unit="ns", limit=limit)
+    return clause.failed(
+        text, measured=distance, unit="ns", limit=limit, worst=occurrence(last, None, distance)
+    )
+
+
+def _group_gap(clause: Clause, members: Sequence[Member]) -> ExpectationResult:
+    spans = sorted(
+        (member.start_ns, member.end_ns, member.names[0])
+        for member in members
+        if member.start_ns is not None and member.end_ns is not None
+    )
+    limit = f"at most {duration_text(clause.expected.max)}"
+    if len(spans) < 2:  # noqa: PLR2004 - an interval lies between two recordings
+        return clause.skipped(f"the group has {counted(len(spans), 'recording')} with messages")
+    longest, before, after, end = 0, "", "", spans[0][1]
+    bad = 0
+    previous = spans[0][2]
+    for start, stop, name in spans[1:]:
+        gap = start - end
+        bad += gap > clause.expected.max
+        if gap > longest:
+            longest, before, after = gap, previous, name
+        if stop > end:
+            end, previous = stop, name
+    if not longest:
+        return clause.passed(f"no interval is missing; expected {limit}", measured=0, unit="ns", limit=limit)
+    text = f"{duration_text(longest)} are missing between {before} and {after}; expected {limit}"
+    if not bad:
+        return clause.passed(text, measured=longest, unit="ns", limit=limit)
+    return clause.failed(text, measured=longest, unit="ns", limit=limit, violations=bad)

@@ -6,8 +6,17 @@ from collections.abc import Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.contracts import texts
-from mosaico_ingest.contracts.clauses import Clause, occurrence
+from mosaico_ingest.contracts.clauses import (
+    Clause,
+    bounds_text,
+    duration_text,
+    extremes_text,
+    limit_text,
+    number_text,
+    occurrence,
+    part_text,
+    value_text,
+)
 from mosaico_ingest.contracts.values import (
     AllowedValues,
     Changes,
@@ -25,7 +34,7 @@ from mosaico_ingest.report.contract import ExpectationResult, Occurrence
 from mosaico_ingest.report.units import count_text, counted
 
 if TYPE_CHECKING:
-    from mosaico_ingest.contracts.row_monitor import FieldCheck, RowMonitor
+    from mosaico_ingest.contracts.rows import FieldCheck, RowMonitor
 
 
 def header_result(clause: Clause, monitors: Sequence[RowMonitor], msgtype: str) -> ExpectationResult:
@@ -58,8 +67,8 @@ def field_result(clause: Clause, monitors: Sequence[RowMonitor]) -> ExpectationR
         return _nulls(clause, accumulators[0].limit, violations, total, subject)
     if isinstance(accumulators[0], Unchanged):
         longest = max(one.longest_ns for one in accumulators if isinstance(one, Unchanged))
-        limit = f"at most {texts.duration(clause.expected.max)}"
-        text = f"{subject} does not change for {texts.duration(longest)}; expected {limit}"
+        limit = f"at most {duration_text(clause.expected.max)}"
+        text = f"{subject} does not change for {duration_text(longest)}; expected {limit}"
         return _from_violations(clause, violations, text, limit=limit, measured=longest, unit="ns")
     return _values(clause, accumulators, violations, total, subject)
 
@@ -74,7 +83,7 @@ def _values(
         measured = _plain(violations.worst.value)
         text = (
             f"{subject}: {count_text(violations.count)} of {counted(total, 'value')} violate the expectation, "
-            f"the worst is {texts.value(violations.worst.value)}; expected {limit}"
+            f"the worst is {value_text(violations.worst.value)}; expected {limit}"
         )
     return _from_violations(clause, violations, text, limit=limit, measured=measured)
 
@@ -85,16 +94,16 @@ def _description(accumulators: Sequence[Any]) -> tuple[str, Any, str]:
     if isinstance(first, FiniteNumbers):
         return "finite numbers", None, "all values are finite"
     if isinstance(first, AllowedValues):
-        return " or ".join(texts.value(value) for value in first.allowed), None, "all values are allowed"
+        return " or ".join(value_text(value) for value in first.allowed), None, "all values are allowed"
     ranges: list[NumberLimits | Changes] = list(accumulators)
     lows = [one.lowest for one in ranges if one.lowest is not None]
     highs = [one.highest for one in ranges if one.highest is not None]
-    low = None if first.low == -inf else texts.number(first.low)
-    high = None if first.high == inf else texts.number(first.high)
-    limit = texts.bounds(low, high)
+    low = None if first.low == -inf else number_text(first.low)
+    high = None if first.high == inf else number_text(first.high)
+    limit = bounds_text(low, high)
     if not lows or not highs:
         return limit, None, "there is no number"
-    text = f"from {texts.number(min(lows))} to {texts.number(max(highs))}"
+    text = f"from {number_text(min(lows))} to {number_text(max(highs))}"
     if isinstance(first, Changes):
         text = f"changes {text} between messages"
     return limit, _plain(max(highs) if low is None else min(lows)), text
@@ -103,7 +112,7 @@ def _description(accumulators: Sequence[Any]) -> tuple[str, Any, str]:
 def _nulls(
     clause: Clause, limit: Limit, violations: Violations, total: int, subject: str
 ) -> ExpectationResult:
-    part = texts.part(limit, violations.count, total, "values are null")
+    part = part_text(limit, violations.count, total, "values are null")
     return _from_limit(
         clause, limit, violations.count, total, violations, text=f"{subject}: {part}", unit="values"
     )
@@ -114,12 +123,12 @@ def _moments(clause: Clause, checks: Sequence[FieldCheck]) -> ExpectationResult:
     one = max(moments, key=lambda moment: moment.count)
     measured = one.mean if clause.key == "mean" else one.std
     expected = clause.expected
-    bounds = (None if bound is None else texts.number(bound) for bound in (expected.min, expected.max))
-    limit = texts.bounds(*bounds)
+    bounds = (None if bound is None else number_text(bound) for bound in (expected.min, expected.max))
+    limit = bounds_text(*bounds)
     name = "mean" if clause.key == "mean" else "standard deviation"
     if measured is None:
         return clause.skipped("the topic has no finite values")
-    text = f"`{checks[0].expression.text}`: the {name} is {texts.number(measured)}; expected {limit}"
+    text = f"`{checks[0].expression.text}`: the {name} is {number_text(measured)}; expected {limit}"
     is_good = (expected.min is None or measured >= expected.min) and (
         expected.max is None or measured <= expected.max
     )
@@ -132,8 +141,8 @@ def _latency(clause: Clause, ranges: Sequence[LatencyRange]) -> ExpectationResul
     if not count:
         return clause.skipped("the topic has no message that can be decoded")
     expected = clause.expected
-    limit = texts.bounds(
-        *(None if bound is None else texts.duration(bound) for bound in (expected.min, expected.max))
+    limit = bounds_text(
+        *(None if bound is None else duration_text(bound) for bound in (expected.min, expected.max))
     )
     violations = _worst([one.violations for one in ranges])
     lowest = min((one.lowest for one in ranges if one.lowest), key=_number, default=None)
@@ -141,7 +150,7 @@ def _latency(clause: Clause, ranges: Sequence[LatencyRange]) -> ExpectationResul
     if lowest is None or highest is None:
         text = f"the stamps of all {counted(count, 'message')} are zero, so there is no latency; expected {limit}"
         return _from_violations(clause, violations, text, limit=limit, measured=None, unit="ns")
-    text = f"the latency is from {texts.duration(_number(lowest))} to {texts.duration(_number(highest))}; expected {limit}"
+    text = f"the latency is from {duration_text(_number(lowest))} to {duration_text(_number(highest))}; expected {limit}"
     if unset:
         text += f", and the stamps of {counted(unset, 'message')} are zero"
     too_low = expected.min is not None and _number(lowest) < expected.min
@@ -157,7 +166,7 @@ def _stamps(clause: Clause, monitors: Sequence[RowMonitor]) -> ExpectationResult
     limit = " and ".join(violations)
     problems: list[str] = []
     if (back := violations.get("monotonic")) and back.count and back.worst is not None:
-        size = texts.duration(-_number(back.worst))
+        size = duration_text(-_number(back.worst))
         problems.append(f"{counted(back.count, 'stamp')} are earlier than the one before, by up to {size}")
     if (same := violations.get("unique")) and same.count:
         problems.append(f"{counted(same.count, 'stamp')} are equal to the one before")
@@ -196,7 +205,7 @@ def _header_numbers(clause: Clause, monitors: Sequence[RowMonitor]) -> Expectati
         return clause.skipped("the messages have no sequence numbers")
     missing = sum(one.missing for one in numbers)
     limit: Limit = clause.expected.missing
-    text = texts.part(limit, missing, missing + count, "sequence numbers are missing")
+    text = part_text(limit, missing, missing + count, "sequence numbers are missing")
     violations = _worst([one.violations for one in numbers])
     return _from_limit(clause, limit, missing, missing + count, violations, text=text, unit="messages")
 
@@ -215,8 +224,8 @@ def _from_limit(
     return _from_violations(
         clause,
         Violations() if limit.allows(count, total) else violations,
-        f"{text}; expected {texts.limit(limit)}",
-        limit=texts.limit(limit),
+        f"{text}; expected {limit_text(limit)}",
+        limit=limit_text(limit),
         measured=limit.measure(count, total),
         unit=unit if limit.share is None else "share",
     )
@@ -249,7 +258,7 @@ def _from_violations(
         return clause.passed(text, measured=measured, unit=unit, limit=limit)
     first, worst = _occurrence(violations.first), _occurrence(violations.worst)
     return clause.failed(
-        text + texts.extremes(first, worst),
+        text + extremes_text(first, worst),
         measured=measured,
         unit=unit,
         limit=limit,

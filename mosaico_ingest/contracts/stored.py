@@ -16,9 +16,8 @@ from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.adapters.mapping.expressions import FieldAccess, TypedExpression
 from mosaico_ingest.contracts.clauses import Clause, Contract
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate
-from mosaico_ingest.contracts.expressions import message_rows, ontology_rows
 from mosaico_ingest.contracts.monitor import TopicMonitor, referenced_topics, topic_monitor
-from mosaico_ingest.contracts.row_monitor import RowMonitor, row_monitor
+from mosaico_ingest.contracts.rows import RowMonitor, message_rows, ontology_rows, row_monitor
 from mosaico_ingest.contracts.values import Batch
 from mosaico_ingest.destinations.store import Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError

@@ -1,23 +1,45 @@
-"""Streaming accumulators over the log times of one topic.
+"""Log times of topics: streaming accumulators, the order in the files, and the windows in which the recorder did not record.
 
 Times arrive in batches, in order. Every accumulator carries the state across batches that makes its result independent
 of the size of the batches.
+
+The known events are those of rosbag2_dynamic_recorder: `PauseEvent` with an `action` (0 paused, 1 resumed), and
+`SubscriptionChangeEvent` with a `topic` and an `action` (0 subscribed, 1 unsubscribed). Types of other packages with the
+same names and fields count, too.
 """
 
 from __future__ import annotations
 
+import threading
+from collections import defaultdict
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 from msgspec import Struct
 from numpy.typing import NDArray
 
+from mosaico_ingest.contracts.values import missing_between
 from mosaico_ingest.job.values import Interval
+from mosaico_ingest.rosbag.blocks import LATEST_NS, Connection, Encoding, Int64s, MessageBlock, fixed_slices
+from mosaico_ingest.rosbag.recording import Recording
 
-Int64s = NDArray[np.int64]
 PERIOD_SAMPLE = 1000
 """Number of first intervals whose median is a topic's period."""
 _NONE = np.zeros(0, np.int64)
+
+
+_SEQUENCE_AT = 20
+"""Bytes from the sequence number of an MCAP message record to its payload."""
+_PAUSE, _SUBSCRIPTION = "PauseEvent", "SubscriptionChangeEvent"
+_FIELDS = {_PAUSE: {"action"}, _SUBSCRIPTION: {"action", "topic"}}
+_STARTS = {_PAUSE: 0, _SUBSCRIPTION: 1}
+"""The action that starts a window without messages; the other action ends it."""
+Windows = NDArray[np.int64]
+"""Start and end of each window in nanoseconds since the epoch, sorted and disjoint, shape (n, 2)."""
+NO_WINDOWS: Windows = np.zeros((0, 2), np.int64)
 
 
 class Gap(Struct, frozen=True):
@@ -230,3 +252,274 @@ class TopicTimes:
             self.longest = Gap(end - length, end, index + position)
         for gaps in self.gaps.values():
             gaps.add(intervals, ends, index)
+
+
+class FileStep(Struct, frozen=True):
+    """A step of the log times or sequence numbers between two messages that are consecutive in a file."""
+
+    size: int
+    """Nanoseconds of a step back, or number of missing sequence numbers."""
+    log_time_ns: int
+    """Log time of the second message."""
+
+
+class FileSteps(Struct, frozen=True):
+    """The steps that violate the order: their number, their sum, the first one and the largest one."""
+
+    count: int = 0
+    total: int = 0
+    first: FileStep | None = None
+    worst: FileStep | None = None
+
+    def __add__(self, later: FileSteps) -> FileSteps:
+        """Return both, in the order of the file."""
+        steps = [step for step in (self.worst, later.worst) if step is not None]
+        worst = max(steps, key=lambda step: step.size, default=None)
+        return FileSteps(self.count + later.count, self.total + later.total, self.first or later.first, worst)
+
+
+class _Piece(Struct, frozen=True):
+    """Messages of one connection that are consecutive in a file."""
+
+    split: int
+    offset: int
+    times: tuple[int, int]
+    """First and last log time, in the order of the file."""
+    numbers: tuple[int, int]
+    """First and last sequence number."""
+    back: FileSteps
+    missing: FileSteps
+    any_number: bool
+    """Whether a sequence number is not zero."""
+
+
+class _Records(Struct, frozen=True):
+    """Messages of one connection: their position in the file, log times and sequence numbers, shape (n,)."""
+
+    split: int
+    offsets: Int64s
+    times: Int64s
+    numbers: Int64s
+
+
+class FileOrder:
+    """Observes the messages of some connections before they are sorted by time.
+
+    Several threads may add messages, and the chunks of a file may be read in any order. Each chunk is reduced to its own result, and the results are joined in
+    the order of the file. Messages outside chunks are kept until the end, with 24 bytes for each.
+    """
+
+    def __init__(self, *, has_numbers: bool) -> None:
+        self._has_numbers = has_numbers
+        self._lock = threading.Lock()
+        self._pieces: dict[int, list[_Piece]] = defaultdict(list)
+        self._records: dict[int, list[_Records]] = defaultdict(list)
+
+    def add(self, split: int, connection: int, block: MessageBlock) -> None:
+        """Add messages that were read together, over the buffer that holds their records."""
+        order = np.lexsort((block.starts, block.offsets))
+        offsets, times, starts = block.offsets[order], block.log_times[order], block.starts[order]
+        numbers = np.zeros(len(times), np.int64)
+        if self._has_numbers and int(starts.min()) >= _SEQUENCE_AT:
+            words = fixed_slices(block.data, starts - _SEQUENCE_AT, 4)
+            numbers = words.view("<u4").reshape(-1).astype(np.int64)
+        edges = (np.flatnonzero(np.diff(offsets)) + 1).tolist()
+        if len(edges) == len(times) - 1:  # the offsets are those of messages, not of chunks
+            with self._lock:
+                self._records[connection].append(_Records(split, offsets, times, numbers))
+            return
+        pieces = [
+            _piece(split, int(offsets[start]), times[start:end], numbers[start:end])
+            for start, end in pairwise((0, *edges, len(times)))
+        ]
+        with self._lock:
+            self._pieces[connection] += pieces
+
+    def steps_back(self, connection: int) -> FileSteps:
+        """Return the messages of a connection with an earlier log time than the message before them in the file."""
+        pieces = self._in_file_order(connection)
+        result = FileSteps()
+        for position, piece in enumerate(pieces):
+            before = pieces[position - 1] if position else None
+            if before is not None and before.split == piece.split:
+                result += _back(np.array([before.times[1], piece.times[0]], np.int64))
+            result += piece.back
+        return result
+
+    def missing_numbers(self, connection: int) -> FileSteps | None:
+        """Return the sequence numbers that no message of a connection has; None if its messages are not numbered."""
+        pieces = self._in_file_order(connection)
+        if not any(piece.any_number for piece in pieces):
+            return None
+        result = FileSteps()
+        for position, piece in enumerate(pieces):
+            if position:
+                numbers = np.array([pieces[position - 1].numbers[1], piece.numbers[0]], np.int64)
+                result += _missing(numbers, np.array(piece.times[:1] * 2, np.int64))
+            result += piece.missing
+        return result
+
+    def _in_file_order(self, connection: int) -> list[_Piece]:
+        pieces = self._pieces.get(connection, [])
+        by_split: dict[int, list[_Records]] = defaultdict(list)
+        for records in self._records.get(connection, ()):
+            by_split[records.split].append(records)
+        joined = [
+            piece
+            for split, records in by_split.items()
+            for piece in _joined(records, [piece.offset for piece in pieces if piece.split == split])
+        ]
+        return sorted([*pieces, *joined], key=lambda piece: (piece.split, piece.offset))
+
+
+def _joined(records: list[_Records], cuts: list[int]) -> Iterator[_Piece]:
+    """Yield the records of a split as pieces, which end where the pieces at the offsets `cuts` start."""
+    offsets = np.concatenate([part.offsets for part in records])
+    order = np.argsort(offsets, kind="stable")
+    offsets = offsets[order]
+    times = np.concatenate([part.times for part in records])[order]
+    numbers = np.concatenate([part.numbers for part in records])[order]
+    edges = sorted({0, *np.searchsorted(offsets, np.array(cuts, np.int64)).tolist(), len(offsets)})
+    for start, end in pairwise(edges):
+        yield _piece(records[0].split, int(offsets[start]), times[start:end], numbers[start:end])
+
+
+def _piece(split: int, offset: int, times: Int64s, numbers: Int64s) -> _Piece:
+    return _Piece(
+        split,
+        offset,
+        (int(times[0]), int(times[-1])),
+        (int(numbers[0]), int(numbers[-1])),
+        _back(times),
+        _missing(numbers, times),
+        bool(numbers.any()),
+    )
+
+
+def _back(times: Int64s) -> FileSteps:
+    return _steps(np.maximum(-np.diff(times), 0), times)
+
+
+def _missing(numbers: Int64s, times: Int64s) -> FileSteps:
+    return _steps(missing_between(np.diff(numbers)), times)
+
+
+def _steps(sizes: NDArray[np.int64], times: Int64s) -> FileSteps:
+    positions = np.flatnonzero(sizes)
+    if not len(positions):
+        return FileSteps()
+    first, worst = int(positions[0]), int(sizes.argmax())
+    return FileSteps(
+        len(positions),
+        int(sizes.sum()),
+        FileStep(int(sizes[first]), int(times[first + 1])),
+        FileStep(int(sizes[worst]), int(times[worst + 1])),
+    )
+
+
+class RecorderEvents(Struct, frozen=True):
+    """The windows in which the recorder did not record."""
+
+    paused: Windows = NO_WINDOWS
+    by_topic: Mapping[str, Windows] = {}
+
+    def windows_of(self, topic: str) -> Windows:
+        """Return the windows in which a topic was not recorded."""
+        own = self.by_topic.get(topic)
+        return self.paused if own is None else _merged([*self.paused.tolist(), *own.tolist()])
+
+
+def event_connections(connections: Iterable[Connection]) -> tuple[Connection, ...]:
+    """Return the connections whose messages are events of the recorder."""
+    return tuple(
+        connection
+        for connection in connections
+        if connection.definition is not None
+        and connection.encoding is not Encoding.OTHER
+        and connection.count != 0
+        and _FIELDS.get(_kind(connection), {""})
+        <= {field.name for field in connection.definition.message.fields}
+    )
+
+
+def read_events(recording: Recording) -> RecorderEvents:
+    """Read the events of the recorder; events that cannot be decoded are ignored."""
+    connections = {connection.id: connection for connection in event_connections(recording.connections)}
+    if not connections:
+        return RecorderEvents()
+    from mosaico_ingest.decode.decoder import decoder_for  # noqa: PLC0415 - few recordings have events
+
+    decoders = {key: decoder_for(connection) for key, connection in connections.items()}
+    events: list[tuple[int, str, str, bool]] = []
+    for block in recording.message_blocks(tuple(connections)):
+        decoded = decoders[block.connection].decode(block)
+        kind = _kind(connections[block.connection])
+        rows: Any = decoded.rows  # the stubs lack to_pylist of struct arrays
+        for row, time in zip(rows.to_pylist(), block.log_times[decoded.index].tolist(), strict=True):
+            topic = str(row["topic"]) if kind == _SUBSCRIPTION else ""
+            events.append((time, kind, topic, int(row["action"]) == _STARTS[kind]))
+    events.sort(key=lambda event: event[0])
+    paused = _windows((time, starts) for time, kind, _, starts in events if kind == _PAUSE)
+    topics = dict.fromkeys(topic for _, kind, topic, _ in events if kind == _SUBSCRIPTION)
+    return RecorderEvents(
+        paused,
+        {
+            name: _windows((time, starts) for time, _, topic, starts in events if topic == name)
+            for name in topics
+        },
+    )
+
+
+def uncovered_ns(starts: NDArray[np.int64], ends: NDArray[np.int64], windows: Windows) -> NDArray[np.int64]:
+    """Return the longest part of each interval that no window covers, in nanoseconds, shape (n,)."""
+    return np.array(
+        [
+            _longest_rest(start, end, windows)
+            for start, end in zip(starts.tolist(), ends.tolist(), strict=True)
+        ],
+        np.int64,
+    )
+
+
+def covered_ns(start: int, end: int, windows: Windows) -> int:
+    """Return the time of an interval that windows cover, in nanoseconds."""
+    overlaps = np.minimum(windows[:, 1], end) - np.maximum(windows[:, 0], start)
+    return int(overlaps[overlaps > 0].sum())
+
+
+def _longest_rest(start: int, end: int, windows: Windows) -> int:
+    inside = windows[(windows[:, 1] > start) & (windows[:, 0] < end)]
+    rest, position = 0, start
+    for window_start, window_end in inside.tolist():
+        rest = max(rest, window_start - position)
+        position = max(position, window_end)
+    return max(rest, end - position)
+
+
+def _kind(connection: Connection) -> str:
+    return connection.msgtype.rpartition("/")[2]
+
+
+def _windows(events: Iterable[tuple[int, bool]]) -> Windows:
+    """Return the windows between events that start and end one; a window that never ends lasts forever."""
+    windows: list[list[int]] = []
+    start: int | None = None
+    for time, starts in events:
+        if starts and start is None:
+            start = time
+        elif not starts and start is not None:
+            windows.append([start, time])
+            start = None
+    if start is not None:
+        windows.append([start, LATEST_NS])
+    return _merged(windows)
+
+
+def _merged(windows: list[list[int]]) -> Windows:
+    merged: list[list[int]] = []
+    for start, end in sorted(windows):
+        if merged and start <= merged[-1][1]:
+            merged[-1][1] = max(merged[-1][1], end)
+        else:
+            merged.append([start, end])
+    return np.array(merged, np.int64).reshape(-1, 2)

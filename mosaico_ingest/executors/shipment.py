@@ -15,7 +15,7 @@ from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import JobSettings
-from mosaico_ingest.metadata.schema import schema_files
+from mosaico_ingest.metadata.validation import schema_files
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.rosbag.definitions.registry import definition_files

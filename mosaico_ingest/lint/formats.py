@@ -17,6 +17,12 @@ from mosaico_ingest.lint.pages import page_of
 from mosaico_ingest.rules import RULES, Rule
 from mosaico_ingest.version import __version__
 
+_COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
+_ESCAPES = (("%", "%25"), ("\r", "%0D"), ("\n", "%0A"))
+_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
+_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
+_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}
+
 
 def _render_json(report: LintReport) -> str:
     """Return `{version, files, skipped, findings}`. Lines and columns start at 1; end columns are exclusive."""
@@ -50,10 +56,6 @@ def _finding(finding: Finding) -> dict[str, Any]:
     }
 
 
-_COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
-_ESCAPES = (("%", "%25"), ("\r", "%0D"), ("\n", "%0A"))
-
-
 def _render_github(report: LintReport) -> str:
     """Return one workflow command per finding."""
     return "".join(f"{_line(finding)}\n" for finding in report.findings)
@@ -78,9 +80,6 @@ def _escaped(text: str) -> str:
 
 def _property(text: str) -> str:
     return _escaped(text).replace(":", "%3A").replace(",", "%2C")
-
-
-_NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
 
 
 class Case(Struct, frozen=True):
@@ -153,10 +152,6 @@ def _attribute(text: str) -> str:
 
 def _text(text: str) -> str:
     return escape(_NOT_XML.sub("\ufffd", text))
-
-
-_SCHEMA = "https://json.schemastore.org/sarif-2.1.0.json"
-_LEVELS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "note"}
 
 
 def _render_sarif(report: LintReport) -> str:

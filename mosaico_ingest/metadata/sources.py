@@ -16,8 +16,7 @@ from mosaico_ingest.findings import Finding, Severity, Span, join_names, nearest
 from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.model import Job, Origin
 from mosaico_ingest.job.yaml_source import KeyPath, Source
-from mosaico_ingest.metadata.schema import load_schema, read_json
-from mosaico_ingest.metadata.validation import with_required_types
+from mosaico_ingest.metadata.validation import load_schema, read_json, with_required_types
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.recording import Recording
 

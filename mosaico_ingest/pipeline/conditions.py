@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.columns import pt
 from mosaico_ingest.adapters.mapping.types import format_type, is_list
-from mosaico_ingest.contracts.expressions import (
+from mosaico_ingest.contracts.rows import (
     Evaluator,
     FieldExpression,
     Locate,

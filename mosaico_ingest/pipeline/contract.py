@@ -9,8 +9,8 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.contracts.order import FileOrder
-from mosaico_ingest.contracts.recording_monitor import RecordingMonitor, summary
+from mosaico_ingest.contracts.monitor import RecordingMonitor, summary
+from mosaico_ingest.contracts.times import FileOrder
 from mosaico_ingest.destinations.base import AmendableSession, Session, destination_of
 from mosaico_ingest.errors import ContractError
 from mosaico_ingest.findings import Severity

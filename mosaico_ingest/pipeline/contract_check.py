@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract, ReadTopic
-from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
+from mosaico_ingest.contracts.monitor import RecordingMonitor
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from msgspec import structs
 
 from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.contracts.group import Member, group_results
+from mosaico_ingest.contracts.evaluate import Member, group_results
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.opening import open_job

@@ -8,8 +8,7 @@ import pyarrow as pa
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract
-from mosaico_ingest.contracts.monitor import BlockObserver
-from mosaico_ingest.contracts.recording_monitor import RecordingMonitor
+from mosaico_ingest.contracts.monitor import BlockObserver, RecordingMonitor
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.pipeline.conditions import bind_conditions

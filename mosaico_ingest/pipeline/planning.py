@@ -174,7 +174,7 @@ def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Reco
     """Return the data contract; raise ManifestError if an expression does not fit its topic."""
     contract = Contract.of(job, task.group)
     if contract is not None:
-        from mosaico_ingest.contracts.row_monitor import check_expressions  # noqa: PLC0415 - only contracts need it
+        from mosaico_ingest.contracts.rows import check_expressions  # noqa: PLC0415 - only contracts need it
 
         check_expressions(contract, recording.connections, observed_topics(topics))
     return contract
@@ -185,7 +185,7 @@ def _check_metadata(job: Job, topics: Iterable[TopicPlan]) -> None:
     settings = job.topic_settings.values()
     if job.sequence.metadata_schema is None and all(entry.metadata_schema is None for entry in settings):
         return
-    from mosaico_ingest.metadata.contract import check_metadata_contracts  # noqa: PLC0415 - it loads the YAML parser
+    from mosaico_ingest.metadata.validation import check_metadata_contracts  # noqa: PLC0415 - it loads the YAML parser
 
     check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
 

@@ -50,7 +50,7 @@ def row_times(
     if stamp is StampSource.PUBLISH and publish_times is not None:
         times = _or_log_times(publish_times, log_times)
     elif stamp is StampSource.HEADER:
-        from mosaico_ingest.contracts.headers import stamps_of  # noqa: PLC0415 - only header stamps need it
+        from mosaico_ingest.contracts.rows import stamps_of  # noqa: PLC0415 - only header stamps need it
 
         times = _or_log_times(stamps_of(rows), log_times)
     if offset_ns:

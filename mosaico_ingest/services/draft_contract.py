@@ -1,16 +1,26 @@
-"""A draft of the section `expect`, derived from good recordings: their values with a tolerance."""
+"""A draft of the section `expect`, derived from good recordings: their values and message fields with a tolerance."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
+from enum import Enum
 from glob import escape
 
+import numpy as np
+import pyarrow as pa
+import pyarrow.types as pt
 from msgspec import Struct
+from numpy.typing import NDArray
 
+from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
+from mosaico_ingest.adapters.mapping.types import is_number
+from mosaico_ingest.contracts.clauses import duration_text, number_text
 from mosaico_ingest.contracts.monitor import TopicMonitor
-from mosaico_ingest.contracts.texts import duration, number
+from mosaico_ingest.contracts.rows import Evaluator, FieldExpression, bind_expression, message_rows
+from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.expand import plain
@@ -24,7 +34,7 @@ from mosaico_ingest.report.contract import ContractResult, Outcome
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import counted
 from mosaico_ingest.rosbag.blocks import Connection
-from mosaico_ingest.services.draft_fields import FieldKind, FieldMeter, MeasuredField
+from mosaico_ingest.rosbag.definitions.model import Definition, Language
 
 DEFAULT_TOLERANCE = 20.0
 """Percentage by which the range of the recordings' values is widened."""
@@ -60,6 +70,20 @@ _PROBE = {
     },
 }
 """A contract whose evaluation measures everything that a draft limits."""
+
+
+MAX_FIELDS = 8
+"""Maximum number of expressions per topic, in the order of the message definition."""
+_VECTORS = ({"x", "y"}, {"x", "y", "z"})
+_QUATERNION = {"x", "y", "z", "w"}
+_TIMES = ({"sec", "nanosec"}, {"seconds", "nanos"})
+"""The fields of times and durations, which are not measured."""
+_GEOGRAPHIC = frozenset({"position", "latitude", "longitude", "altitude"})
+"""The names of fields that depend on where a recording is made, so that their range is never stable."""
+_STABLE_SHARE = 0.25
+"""Maximum distance between the limits of both halves of a recording, as a share of the range of all values."""
+_MAX_TEXT = 64
+"""Maximum length of a text that can be expected."""
 
 
 class MeasuredTopic(Struct, frozen=True):
@@ -162,7 +186,7 @@ def draft_contract(recordings: Sequence[MeasuredRecording], *, tolerance: float 
     required = [name for name in names if all(name in one.topics for one in recordings)]
     lines = [
         f"# Drafted by `ingest init --expect` from {counted(len(recordings), 'recording')}: each limit is the range of their values,",
-        f"# widened by {number(tolerance)}%. Review the limits, then write `extends: expect.yaml` in the manifests of the fleet.",
+        f"# widened by {number_text(tolerance)}%. Review the limits, then write `extends: expect.yaml` in the manifests of the fleet.",
         "expect:",
         _line("  # on_failure: divert", "after a failure: fail (the default), warn, or divert"),
         *_recording_lines(recordings, share),
@@ -231,7 +255,7 @@ def _recording_lines(recordings: Sequence[MeasuredRecording], share: float) -> I
     if min(lengths) > 0:
         low, high = _range(lengths, share)
         limits = f"{{min: {_written(low, up=False)}, max: {_written(high, up=True)}}}"
-        yield _line(f"    duration: {limits}", _span_text(lengths, duration))
+        yield _line(f"    duration: {limits}", _span_text(lengths, duration_text))
     if "unreadable" in fulfilled:
         yield "    unreadable: 0"
     if "chunk_crcs" in fulfilled:
@@ -244,7 +268,7 @@ def _recording_lines(recordings: Sequence[MeasuredRecording], share: float) -> I
 
 def _topic_lines(name: str, topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]:
     counts = [topic.count for topic in topics]
-    yield _line(f"    {_quoted(name)}:", f"{_span_text(counts, number)} messages")
+    yield _line(f"    {_quoted(name)}:", f"{_span_text(counts, number_text)} messages")
     types = sorted({topic.msgtype for topic in topics})
     yield f"      type: {types[0] if len(types) == 1 else _flow(types)}"
     rates = [topic.rate_hz for topic in topics if topic.rate_hz is not None]
@@ -252,9 +276,9 @@ def _topic_lines(name: str, topics: Sequence[MeasuredTopic], share: float) -> It
     if all(topic.is_regular for topic in topics):
         low, high = _range(rates, share)
         limits = f"{{min: {_rounded(low, up=False)} Hz, max: {_rounded(high, up=True)} Hz}}"
-        yield _line(f"      rate: {limits}", f"{_span_text(rates, number)} Hz")
+        yield _line(f"      rate: {limits}", f"{_span_text(rates, number_text)} Hz")
         longest = _written(_range(gaps, share)[1], up=True)
-        yield _line(f"      gap: {{max: {longest}}}", _span_text(gaps, duration))
+        yield _line(f"      gap: {{max: {longest}}}", _span_text(gaps, duration_text))
     else:
         yield f"      messages: {{min: {max(1, int(min(counts) * (1 - share)))}}}"
     yield from _header_lines(topics, share)
@@ -275,7 +299,7 @@ def _header_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str
         lows, highs = [low for low, _ in latencies], [high for _, high in latencies]
         low, high = _range([*lows, *highs], share)
         limits = f"{{min: {_written(low, up=False)}, max: {_written(high, up=True)}}}"
-        yield _line(f"      latency: {limits}", _span_text([*lows, *highs], duration))
+        yield _line(f"      latency: {limits}", _span_text([*lows, *highs], duration_text))
     stamps = frozenset[str].intersection(*(topic.stamps for topic in topics))
     if stamps:
         names = sorted(stamps)
@@ -297,7 +321,7 @@ def _field_lines(topics: Sequence[MeasuredTopic], share: float) -> Iterator[str]
         if expected:
             limits = [limit for one in measured if one.limits is not None for limit in one.limits]
             line = f"        {plain(text)}: {{{', '.join(expected)}}}"
-            yield _line(line, _span_text(limits, number)) if limits else line
+            yield _line(line, _span_text(limits, number_text)) if limits else line
 
 
 def _constants(measured: Sequence[MeasuredField]) -> Iterator[str]:
@@ -361,3 +385,140 @@ def _flow(texts: Iterable[str]) -> str:
 
 def _quoted(topic: str) -> str:
     return plain(escape(topic))
+
+
+class FieldKind(Enum):
+    """The kind of a measured expression."""
+
+    FIELD = "field"
+    VECTOR = "vector"
+    """The norm of a vector."""
+    QUATERNION = "quaternion"
+    """The norm of a quaternion."""
+
+
+class MeasuredField(Struct, frozen=True):
+    """The values of an expression in one recording."""
+
+    kind: FieldKind = FieldKind.FIELD
+    limits: tuple[float, float] | None = None
+    """The smallest and the largest floating-point number; None for other values, and if a number is not finite."""
+    is_stable: bool = False
+    """Whether both halves of the recording have about the same limits, and other recordings may have them, too."""
+    constant: str | int | None = None
+    """The only text or whole number of all messages; None if there are several, and for zero and empty texts."""
+    nulls: int | None = None
+    """Number of messages without a value; None if the type of the message requires a value."""
+
+
+class FieldMeter:
+    """Measures expressions over the messages of one topic."""
+
+    def __init__(self, topic: str, definition: Definition, middle_ns: int) -> None:
+        """Create the meter; `middle_ns` is the log time that divides the recording into halves."""
+        self._topic = topic
+        self._msgtype = definition.root
+        self._middle_ns = middle_ns
+        self._is_nullable = definition.language is not Language.ROS
+        rows = message_rows(definition)
+        meters: list[_Meter] = []
+        for text, kind in _expressions(rows.struct, ""):
+            expression, _ = bind_expression(text, rows, None, lambda _start, _end: None)
+            if expression is not None and len(meters) < MAX_FIELDS:
+                name = text.rstrip(")").rpartition(".")[2].removeprefix("norm(")
+                meters.append(_Meter(expression, kind, is_geographic=name in _GEOGRAPHIC))
+        self._meters = tuple(meters)
+
+    def __bool__(self) -> bool:
+        return bool(self._meters)
+
+    def add(self, rows: pa.StructArray, log_times: NDArray[np.int64]) -> None:
+        """Add decoded messages in the ROS shape."""
+        evaluator = Evaluator(rows, Envelope(self._topic, self._msgtype, log_times))
+        is_second = log_times >= self._middle_ns
+        for meter in self._meters:
+            meter.add(evaluator.values(meter.expression), is_second)
+
+    def finish(self) -> dict[str, MeasuredField]:
+        """Return the measured values by expression, without expressions that have no value."""
+        return {
+            meter.expression.text: meter.result(is_nullable=self._is_nullable)
+            for meter in self._meters
+            if meter.count
+        }
+
+
+@dataclass(slots=True)
+class _Meter:
+    """Measures one expression."""
+
+    expression: FieldExpression
+    kind: FieldKind
+    is_geographic: bool
+    count: int = 0
+    nulls: int = 0
+    is_finite: bool = True
+    halves: list[tuple[float, float] | None] = field(default_factory=lambda: [None, None])
+    """The smallest and the largest number of each half of the recording."""
+    constants: set[str | int] = field(default_factory=set[str | int])
+    """The different texts or whole numbers, no more after the second one."""
+
+    def add(self, values: Values, is_second: NDArray[np.bool_]) -> None:
+        """Add the values of a batch, one per row."""
+        data = values.data
+        if values.null is not None:
+            self.nulls += int(values.null.sum())
+            data, is_second = data[~values.null], is_second[~values.null]
+        if not len(data):
+            return
+        self.count += len(data)
+        if not np.issubdtype(data.dtype, np.floating):
+            if len(self.constants) <= 1:
+                self.constants |= {data[0], *data[data != data[0]][:1]}
+        elif not np.isfinite(data).all():
+            self.is_finite = False
+        else:
+            for half, of_half in enumerate((data[~is_second], data[is_second])):
+                if len(of_half):
+                    low, high = self.halves[half] or (np.inf, -np.inf)
+                    self.halves[half] = (min(low, float(of_half.min())), max(high, float(of_half.max())))
+
+    def result(self, *, is_nullable: bool) -> MeasuredField:
+        """Return the measured values."""
+        halves = [half for half in self.halves if half is not None] if self.is_finite else []
+        limits = (min(low for low, _ in halves), max(high for _, high in halves)) if halves else None
+        distance = 0.0 if limits is None else _STABLE_SHARE * (limits[1] - limits[0])
+        (constant,) = self.constants if len(self.constants) == 1 else (None,)
+        return MeasuredField(
+            kind=self.kind,
+            limits=limits,
+            is_stable=len(halves) == len(self.halves)
+            and not self.is_geographic
+            and all(abs(first - second) <= distance for first, second in zip(*halves, strict=True)),
+            constant=_plain(constant) if constant else None,
+            nulls=self.nulls if is_nullable else None,
+        )
+
+
+def _expressions(struct: pa.StructType, prefix: str) -> Iterator[tuple[str, FieldKind]]:
+    """Yield the norms of the vectors and quaternions of a message, and its other numbers and texts outside of lists."""
+    for member in struct:
+        path, kind = f"{prefix}{member.name}", member.type
+        if pt.is_struct(kind):
+            names = {child.name for child in kind}
+            is_floating = all(pt.is_floating(child.type) for child in kind)
+            if is_floating and names == _QUATERNION:
+                yield f"norm({path})", FieldKind.QUATERNION
+            elif is_floating and names in _VECTORS:
+                yield f"norm({path})", FieldKind.VECTOR
+            elif names not in _TIMES and member.name != "header":
+                yield from _expressions(kind, f"{path}.")
+        elif is_number(kind) or pt.is_string(kind):
+            yield path, FieldKind.FIELD
+
+
+def _plain(constant: str | int) -> str | int | None:
+    """Return a constant as a Python value; None for a text that is too long."""
+    if isinstance(constant, str):
+        return constant if len(constant) <= _MAX_TEXT else None
+    return int(constant)

@@ -12,7 +12,7 @@ import pytest
 import mosaico_ingest
 from mosaico_ingest.adapters.mapping.model import adapter_schema
 from mosaico_ingest.job.yaml_source import load_source
-from mosaico_ingest.services.editor_schema import adapter_editor_schema
+from mosaico_ingest.services.schemas import adapter_editor_schema
 
 CATALOG = sorted((Path(mosaico_ingest.__file__).parent / "adapters" / "catalog").glob("*.yaml"))
 VALIDATOR = jsonschema.Draft202012Validator(adapter_schema())

@@ -12,7 +12,7 @@ import pytest
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.cli.completion import completer
 from mosaico_ingest.ontology.registry import DEFINED, MODULES, ontology_type
-from mosaico_ingest.services.editor_schema import adapter_editor_schema, job_editor_schema
+from mosaico_ingest.services.schemas import adapter_editor_schema, job_editor_schema
 
 
 def ingest(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str, str]:

@@ -20,8 +20,7 @@ from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.files import RunReport
 from mosaico_ingest.report.model import Rejection, Report, TopicReport
 from mosaico_ingest.report.units import rate_text, written_text
-from mosaico_ingest.services.draft import draft_manifest
-from mosaico_ingest.services.inspection import estimate_rate_hz
+from mosaico_ingest.services.inspection import draft_manifest, estimate_rate_hz
 from mosaico_ingest.view.values import value_text
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"

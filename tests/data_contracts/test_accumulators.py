@@ -12,9 +12,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.contracts.headers import AllowedTexts
-from mosaico_ingest.contracts.order import FileOrder
-from mosaico_ingest.contracts.times import PERIOD_SAMPLE, Gaps, SlidingWindow, TopicTimes
+from mosaico_ingest.contracts.rows import AllowedTexts
+from mosaico_ingest.contracts.times import PERIOD_SAMPLE, FileOrder, Gaps, SlidingWindow, TopicTimes
 from mosaico_ingest.contracts.values import (
     AllowedValues,
     Batch,

@@ -28,13 +28,15 @@ from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.services.draft_contract import (
+    FieldKind,
+    FieldMeter,
+    MeasuredField,
     MeasuredRecording,
     MeasuredTopic,
     _rounded,
     draft_contract,
     measure_recording,
 )
-from mosaico_ingest.services.draft_fields import FieldKind, FieldMeter, MeasuredField
 
 LONGEST = 20
 

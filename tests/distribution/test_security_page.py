@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.lint.job import JobSettings
+from mosaico_ingest.lint.check import JobSettings
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("job", "rosbag", "decode", "protocol", "serve", "metadata", "adapters")

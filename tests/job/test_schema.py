@@ -10,7 +10,7 @@ from typing import Any
 import jsonschema
 
 from mosaico_ingest.job.reference import job_schema, manifest_reference
-from mosaico_ingest.services.editor_schema import job_editor_schema
+from mosaico_ingest.services.schemas import job_editor_schema
 
 COMMITTED = Path(__file__).parents[2] / "schemas" / "job.schema.json"
 

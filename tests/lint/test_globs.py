@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.lint.job import covers
+from mosaico_ingest.lint.check import covers
 
 PATTERNS = st.text(alphabet="/ab*?", max_size=6)
 NAMES = st.text(alphabet="/ab", max_size=8)

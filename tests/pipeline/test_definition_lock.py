@@ -27,7 +27,7 @@ from mosaico_ingest.pipeline.definition_lock import (
 )
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.services.lock import write_lock
+from mosaico_ingest.services.schemas import write_lock
 
 PACK = "uint8 FULL=1\nfloat32 voltage\nint32 cells\nacme_msgs/Cell first\n"
 CELL = f"{'=' * 80}\nMSG: acme_msgs/Cell\nfloat32 level\n"

@@ -21,7 +21,7 @@ from stamped_messages import MESSAGES, SECOND, STAMPED, START_NS, Messages, stam
 
 from mosaico_ingest import api
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.contracts.expressions import Rows, bind_expression
+from mosaico_ingest.contracts.rows import Rows, bind_expression
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.lint.engine import lint_paths

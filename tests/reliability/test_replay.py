@@ -16,7 +16,7 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.pipeline.quarantine import QuarantineFile
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.services.replay import ReplayState, find_replays, lock_quarantine
+from mosaico_ingest.services.status import ReplayState, find_replays, lock_quarantine
 
 from .conftest import CUT, RunJob, WriteBag, number
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 from importlib import import_module
 from pkgutil import iter_modules
 
-from mosaico_ingest.lint.rule import Check
+from mosaico_ingest.lint.check import Check
 
 __all__ = ["CHECKS"]
 

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.job.adapter_reference import reference_of
-from mosaico_ingest.lint.job import Job, find_module, load_mapping_source, python_reference
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, find_module, load_mapping_source, python_reference
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 from mosaico_ingest.textfile import read_limited
 

@@ -7,8 +7,7 @@ from typing import Any, cast
 
 from mosaico_ingest.adapters.mapping.loader import parameter_problem
 from mosaico_ingest.job.adapter_reference import ParameterizedAdapter
-from mosaico_ingest.lint.job import Job, load_mapping_source
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, load_mapping_source
 
 
 def check(job: Job) -> Iterator[Problem]:

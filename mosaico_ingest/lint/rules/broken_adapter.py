@@ -6,8 +6,15 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.findings import nearest
-from mosaico_ingest.lint.job import Job, adapter_references, find_module, python_reference, read_classes
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import (
+    Check,
+    Job,
+    Problem,
+    adapter_references,
+    find_module,
+    python_reference,
+    read_classes,
+)
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from decimal import Decimal
 
 from mosaico_ingest.findings import Edit
-from mosaico_ingest.lint.job import Job, metadata_sections, value_paths_below
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, metadata_sections, value_paths_below
 
 _TRAILING_ZERO = re.compile(r"[0-9]+\.[0-9]+0")
 _DECIMAL = re.compile(r"[0-9.]+")

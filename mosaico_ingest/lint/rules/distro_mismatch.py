@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.containers import ROS_VERSIONS
-from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, recording_paths
 
 _VERSIONS = {suffix: f"ros{versions[0]}" for suffix, versions in ROS_VERSIONS.items() if len(versions) == 1}
 """The ROS version of containers that store only one."""

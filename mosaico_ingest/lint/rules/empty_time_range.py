@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.job.units import format_time
 from mosaico_ingest.job.values import TimeBound
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:

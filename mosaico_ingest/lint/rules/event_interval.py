@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from functools import partial
 
-from mosaico_ingest.lint.events import event_problems
-from mosaico_ingest.lint.rule import Check
+from mosaico_ingest.lint.check import Check, event_problems
 
 CHECK = Check("event-interval", job=partial(event_problems, rule="event-interval"), reads_files=True)

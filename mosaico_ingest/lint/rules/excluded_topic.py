@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.job.patterns import is_glob, select
-from mosaico_ingest.lint.job import Job, keyed_patterns
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, keyed_patterns
 
 
 def check(job: Job) -> Iterator[Problem]:

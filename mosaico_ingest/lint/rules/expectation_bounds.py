@@ -7,8 +7,7 @@ from typing import Any
 
 from mosaico_ingest.job.expect import Expectation, FieldExpectations
 from mosaico_ingest.job.section import Section
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 
 _BOUNDS = (("min", "max"), ("after", "before"))
 _BETWEEN = "between"

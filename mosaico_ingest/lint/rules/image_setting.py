@@ -9,8 +9,7 @@ from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.image import image_settings
 from mosaico_ingest.job.patterns import first_match, is_glob
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:

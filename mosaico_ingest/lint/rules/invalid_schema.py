@@ -6,9 +6,8 @@ from collections.abc import Iterator
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.fields import PathRole
-from mosaico_ingest.lint.job import Job, manifest_paths
-from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.metadata.schema import load_schema
+from mosaico_ingest.lint.check import Check, Job, Problem, manifest_paths
+from mosaico_ingest.metadata.validation import load_schema
 
 
 def check(job: Job) -> Iterator[Problem]:

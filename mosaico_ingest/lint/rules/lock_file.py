@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 from mosaico_ingest.pipeline.compile import read_lock_file
 from mosaico_ingest.pipeline.definition_lock import read_lock
 

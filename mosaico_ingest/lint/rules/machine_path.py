@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, manifest_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, manifest_paths
 
 
 def check(job: Job) -> Iterator[Problem]:

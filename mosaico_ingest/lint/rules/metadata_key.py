@@ -6,8 +6,7 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.job.values import PROVENANCE_KEY
-from mosaico_ingest.lint.job import Job, key_paths_below, metadata_sections
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, key_paths_below, metadata_sections
 
 _KEY = re.compile(r"[A-Za-z0-9 _-]+")
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, metadata_sections, value_paths_below
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, metadata_sections, value_paths_below
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -11,12 +11,17 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Manifest, combined_settings
 from mosaico_ingest.job.patterns import is_glob
 from mosaico_ingest.job.yaml_source import KeyPath, Source
-from mosaico_ingest.lint.job import Job, manifests_of_matrix
-from mosaico_ingest.lint.rule import Check, Problem
-from mosaico_ingest.metadata.contract import topic_section
-from mosaico_ingest.metadata.schema import MetadataSchema, load_schema, read_json
+from mosaico_ingest.lint.check import Check, Job, Problem, manifests_of_matrix
 from mosaico_ingest.metadata.sources import source_spans
-from mosaico_ingest.metadata.validation import Spans, Violation, violations
+from mosaico_ingest.metadata.validation import (
+    MetadataSchema,
+    Spans,
+    Violation,
+    load_schema,
+    read_json,
+    topic_section,
+    violations,
+)
 
 _SEQUENCE = ("sequence", "metadata")
 

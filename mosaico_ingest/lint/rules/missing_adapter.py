@@ -4,8 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.job import Job, adapter_references, find_module, is_mapping_file, python_reference
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import (
+    Check,
+    Job,
+    Problem,
+    adapter_references,
+    find_module,
+    is_mapping_file,
+    python_reference,
+)
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.containers import SUFFIXES
-from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, recording_paths
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, MessageFile, Problem
 
 _NAME = re.compile(r"[a-z](_?[a-z0-9]+)*")
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.lint.message import MessageFile
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, MessageFile, Problem
 from mosaico_ingest.rosbag.definitions.parser import parse_msg
 
 

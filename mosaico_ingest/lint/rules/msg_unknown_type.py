@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.lint.message import MessageFile, is_defined
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, MessageFile, Problem, is_defined
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
 from mosaico_ingest.rosbag.definitions.registry import suggest_type
 

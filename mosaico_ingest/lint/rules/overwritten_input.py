@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from os.path import normpath
 
-from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, recording_paths
 
 
 def check(job: Job) -> Iterator[Problem]:

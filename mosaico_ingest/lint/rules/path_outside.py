@@ -6,8 +6,7 @@ from collections.abc import Iterator
 from os.path import normpath
 from pathlib import Path
 
-from mosaico_ingest.lint.job import Job, manifest_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, manifest_paths
 
 
 def check(job: Job) -> Iterator[Problem]:

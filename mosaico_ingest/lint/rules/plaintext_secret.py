@@ -6,8 +6,7 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import has_credentials
-from mosaico_ingest.lint.job import Job, value_paths_below
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, value_paths_below
 
 _API_KEY_PATH = ("target", "api_key")
 _NONEMPTY_DEFAULT = re.compile(r"\$\{\w+:-[^}]")

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.adapters.permission import is_python_allowed, python_refusal
-from mosaico_ingest.lint.job import Job, adapter_references, python_reference
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, adapter_references, python_reference
 
 
 def check(job: Job) -> Iterator[Problem]:

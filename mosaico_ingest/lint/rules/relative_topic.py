@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.findings import nearest
 from mosaico_ingest.job.values import DEFAULT_TOPIC
-from mosaico_ingest.lint.job import Job, topic_patterns
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, topic_patterns
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.job.patterns import is_glob
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 
 
 def check(job: Job) -> Iterator[Problem]:

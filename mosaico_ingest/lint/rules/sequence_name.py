@@ -7,8 +7,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.compose import placeholders_in
-from mosaico_ingest.lint.job import Job
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem
 from mosaico_ingest.protocol import check_sequence_name
 
 _INVALID = re.compile(r"[^A-Za-z0-9_-]")

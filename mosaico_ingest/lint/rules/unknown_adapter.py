@@ -8,8 +8,15 @@ from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.adapters.bridge import installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.lint.job import Job, adapter_references, is_mapping_file, loaded_names, python_reference
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import (
+    Check,
+    Job,
+    Problem,
+    adapter_references,
+    is_mapping_file,
+    loaded_names,
+    python_reference,
+)
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -7,8 +7,7 @@ from pathlib import Path
 
 from mosaico_ingest.containers import RECORDING_NAME, SUFFIX_LIST
 from mosaico_ingest.job.patterns import is_glob
-from mosaico_ingest.lint.job import Job, recording_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, recording_paths
 
 
 def check(job: Job) -> Iterator[Problem]:

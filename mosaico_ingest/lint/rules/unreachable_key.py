@@ -6,8 +6,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.job.patterns import is_glob
 from mosaico_ingest.job.yaml_source import Value
-from mosaico_ingest.lint.job import Job, covers, keyed_patterns
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, covers, keyed_patterns
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -7,8 +7,7 @@ from collections.abc import Iterator
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import has_credentials
 from mosaico_ingest.job.fields import PathRole
-from mosaico_ingest.lint.job import Job, manifest_paths
-from mosaico_ingest.lint.rule import Check, Problem
+from mosaico_ingest.lint.check import Check, Job, Problem, manifest_paths
 from mosaico_ingest.remote import is_url, parse_url
 
 _URL_ROLES = [role for role in PathRole if role.accepts_urls]

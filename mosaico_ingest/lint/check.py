@@ -1,14 +1,15 @@
-"""A job manifest as the checks see it: its model, its locations, topic patterns, paths and adapter references."""
+"""What a lint check reads and yields: jobs, `.msg` files and event files in, problems out."""
 
 from __future__ import annotations
 
 import ast
 import json
+import re
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from copy import deepcopy
 from fnmatch import fnmatchcase
-from functools import reduce
+from functools import cache, reduce
 from importlib.machinery import PathFinder
 from pathlib import Path
 
@@ -16,20 +17,54 @@ from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
-from mosaico_ingest.findings import Finding, Span
+from mosaico_ingest.findings import Edit, Finding, Span
 from mosaico_ingest.job.adapter_reference import reference_of
 from mosaico_ingest.job.compose import combinations, fill_in
+from mosaico_ingest.job.events import Event, EventFile, overlaps, read_events
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
 from mosaico_ingest.job.manifest import check_manifest
 from mosaico_ingest.job.model import JobSettings, Manifest
 from mosaico_ingest.job.validation import key_path_of
+from mosaico_ingest.job.values import Stores, TimeBound
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
+from mosaico_ingest.rosbag.definitions.distros import distro_type
+from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
+from mosaico_ingest.rules import RULES
 from mosaico_ingest.textfile import read_limited
 
 _PLACEHOLDER = "missing"
 """Stands for a missing required string, so that the rest of the manifest can be checked."""
 _MAX_REPAIRS = 50
+_SUFFIXES = (".msg", ".idl")
+_DECLARATION = re.compile(
+    r"\s*(?P<type>[A-Za-z]\w*(?:/\w+)*)(?P<bound><=\d+)?(?P<array>\[(?:<=)?\d*\])?\s+(?P<name>\w+)\s*(?P<rest>.*)"
+)
+
+
+class Problem(Struct, frozen=True):
+    """A violation of a rule, without the rule's id and severity."""
+
+    message: str
+    span: Span
+    help: str | None = None
+    fix: Edit | None = None
+
+
+class Check(Struct, frozen=True):
+    """The check of one rule, for jobs or for message definitions."""
+
+    rule: str
+    """The id of the rule."""
+    job: Callable[[Job], Iterable[Problem]] | None = None
+    message: Callable[[MessageFile], Iterable[Problem]] | None = None
+    reads_files: bool = False
+    """Whether the check looks at files next to the document. Such checks do not run on examples in Markdown pages."""
+
+    def finding(self, problem: Problem) -> Finding:
+        """Return a problem as a finding of this rule."""
+        rule = RULES[self.rule]
+        return Finding(rule.id, rule.severity, problem.message, problem.span, problem.help, problem.fix)
 
 
 class Job(Struct, frozen=True):
@@ -286,3 +321,114 @@ def read_classes(file: Path) -> dict[str, bool]:
         elif isinstance(node, ast.Assign):
             names.update({target.id: True for target in node.targets if isinstance(target, ast.Name)})
     return names
+
+
+class Declaration(Struct, frozen=True):
+    """One line of a definition: a field or a constant."""
+
+    type: str
+    name: str
+    is_constant: bool
+    type_span: Span
+    name_span: Span
+
+
+class MessageFile(Struct, frozen=True):
+    """The text of a message definition."""
+
+    file: str
+    text: str
+    declarations: tuple[Declaration, ...]
+    path: Path | None = None
+    """The file that contains the text, or None."""
+
+    @property
+    def name(self) -> str:
+        """The name of the type: the file name without `.msg`."""
+        return Path(self.file).stem
+
+    def lines(self) -> Iterator[tuple[Span, str]]:
+        """Yield every line that is not blank, with its span."""
+        for number, line in enumerate(self.text.splitlines(), 1):
+            if line.strip():
+                start = len(line) - len(line.lstrip()) + 1
+                yield Span(self.file, number, start, number, len(line.rstrip()) + 1), line
+
+
+def read_message(text: str, *, file: str, path: Path | None = None) -> MessageFile:
+    """Return the declarations of a definition. Lines that are not declarations are skipped."""
+    declarations = [
+        _declaration(match, file, number)
+        for number, line in enumerate(text.splitlines(), 1)
+        if (match := _DECLARATION.fullmatch(_without_comment(line)))
+    ]
+    return MessageFile(file, text, tuple(declarations), path)
+
+
+def is_defined(msgtype: str, path: Path | None) -> bool:
+    """Return whether a type is defined next to the file at `path`, in a neighboring package, or in a ROS distribution."""
+    package, _, name = msgtype.rpartition("/")
+    if path is not None:
+        package = package.removesuffix("/msg")
+        folders = [path.parent] if not package else _package_folders(path.parent, package)
+        if any((folder / f"{name}{suffix}").is_file() for folder in folders for suffix in _SUFFIXES):
+            return True
+    return bool(package) and _is_in_distro(normalize_msgtype(msgtype))
+
+
+def _package_folders(folder: Path, package: str) -> list[Path]:
+    """Return the folders that may contain the definitions of a package, given a folder that refers to it."""
+    own = [folder] if package in {folder.name, folder.parent.name} else []
+    parents = [folder.parent, folder.parent.parent]
+    return own + [parent / package / inner for parent in parents for inner in ("", "msg")]
+
+
+@cache
+def _is_in_distro(msgtype: str) -> bool:
+    return any(distro_type(distro, msgtype) is not None for distro in reversed(Stores))
+
+
+def _without_comment(line: str) -> str:
+    """Return a line without its comment. The value of a string constant may contain a `#`."""
+    before = line.split("#", 1)[0]
+    return (line if "=" in before else before).rstrip()
+
+
+def _declaration(match: re.Match[str], file: str, number: int) -> Declaration:
+    def span(group: str) -> Span:
+        return Span(file, number, match.start(group) + 1, number, match.end(group) + 1)
+
+    return Declaration(
+        match["type"], match["name"], match["rest"].startswith("="), span("type"), span("name")
+    )
+
+
+def event_problems(job: Job, rule: str) -> Iterator[Problem]:
+    """Yield the problems of one rule; a file that does not exist is a problem of `missing-file`."""
+    split = job.manifest.split
+    if split is None or not job.is_expanded(split.events):
+        return
+    path = job.resolve(str(split.events))
+    if path.is_file():
+        for finding in _findings(read_events(path)):
+            if finding.rule == rule and finding.span is not None:
+                yield Problem(finding.message, finding.span, finding.help)
+
+
+def _findings(file: EventFile) -> Iterator[Finding]:
+    """Yield the findings of a file; overlaps only between events whose times are relative to the same moment."""
+    yield from file.findings
+    by_reference: dict[str, list[tuple[int, int, Event]]] = {}
+    for event in file.events:
+        reference = _reference(event.start)
+        if reference == _reference(event.end):
+            by_reference.setdefault(reference, []).append((event.start.ns, event.end.ns, event))
+    for intervals in by_reference.values():
+        yield from overlaps(intervals)
+
+
+def _reference(bound: TimeBound) -> str:
+    """Return the moment that a bound is relative to."""
+    if not bound.relative:
+        return "epoch"
+    return "last message" if bound.ns < 0 else "first message"
