@@ -18,7 +18,7 @@ from measure import run, typical
 
 from mosaico_ingest.images.encode import encode_image
 from mosaico_ingest.images.encodings import RawImage
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

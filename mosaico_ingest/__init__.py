@@ -88,7 +88,7 @@ _MODULES = {
     "ROSTypeRegistry": "rosbag.definitions.registry",
     "Report": "report.model",
     "RosbagInjector": "api",
-    "RunReport": "report.model",
+    "RunReport": "report.files",
     "Serializable": "ontology",
     "SessionLevelErrorPolicy": "job.values",
     "Store": "destinations.store",

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import structs
 
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import IngestError, ManifestError
-from mosaico_ingest.executors.base import choose_executor
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import Job
@@ -30,7 +30,6 @@ from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
 from mosaico_ingest.report.files import RunReport, UsedManifest
 from mosaico_ingest.report.model import Report
-from mosaico_ingest.textfile import read_limited
 from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
@@ -331,7 +330,10 @@ def run(
         tasks = LazySequence.of(add_group_results(tasks))
     from mosaico_ingest.pipeline.known import mark_known
 
-    executor = executor or choose_executor(tasks)
+    if executor is None:
+        from mosaico_ingest.executors.base import choose_executor
+
+        executor = choose_executor(tasks)
     tool = f"mosaico-ingest {__version__}"
     if report is None:
         recordings = tuple(executor.map(tasks if verify else mark_known(tasks), observe))
@@ -386,7 +388,7 @@ def used_manifest(path: Path) -> UsedManifest:
     Raises:
         ManifestError: The manifest cannot be read.
     """
-    from mosaico_ingest.job.expand import manifest_text
+    from mosaico_ingest.job.reference import manifest_text
 
     return UsedManifest(path=str(path), text=manifest_text(path))
 

@@ -1,4 +1,4 @@
-"""The base of JSON documents (reports, plans, inspections), and JSON Schemas of models.
+"""Text files, JSON documents with their schemas, and tables for notebooks.
 
 Pydantic's `use_attribute_docstrings` would read the source of every class at each import; here only the schema reads it.
 """
@@ -6,10 +6,17 @@ Pydantic's `use_attribute_docstrings` would read the source of every class at ea
 from __future__ import annotations
 
 import ast
+import errno
 import inspect
 import json
+import os
+from collections.abc import Collection, Iterable, Sequence
+from contextlib import suppress
 from functools import cache
-from itertools import pairwise
+from html import escape
+from itertools import islice, pairwise
+from pathlib import Path
+from stat import S_ISDIR, S_ISREG
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
@@ -18,15 +25,69 @@ from pydantic_core import CoreSchema, core_schema
 from pydantic_core.core_schema import ModelSchema
 from typing_extensions import Self
 
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import escape_undecodable
+from mosaico_ingest.remote import AnyPath
 
 if TYPE_CHECKING:
     from jsonschema.protocols import Validator
 
+MAX_FILE_BYTES = 64 * 1024 * 1024
+"""Maximum size of a manifest, definition, plan or report that is read, in bytes."""
 DIALECT = "https://json-schema.org/draft/2020-12/schema"
 _MAX_MESSAGE = 200
 """Maximum length of a schema violation in an error message, as it repeats the value."""
+_Model = TypeVar("_Model", bound=BaseModel)
+MAX_ROWS = 100
+"""Rows of a table; the last line states how many there are."""
+
+
+def read_limited(path: AnyPath) -> bytes:
+    """Return the content of a file.
+
+    Raises:
+        OSError: The file cannot be read, is a pipe or a device (which could block), or is larger than `MAX_FILE_BYTES`.
+    """
+    mode = path.stat().st_mode
+    if not S_ISREG(mode) and not S_ISDIR(mode):
+        raise OSError(errno.EINVAL, "a pipe, a socket or a device, not a file", str(path))
+    with path.open("rb") as file:
+        content = file.read(MAX_FILE_BYTES + 1)
+    if len(content) > MAX_FILE_BYTES:
+        raise OSError(errno.EFBIG, f"longer than {MAX_FILE_BYTES >> 20} MiB", str(path))
+    return content
+
+
+def check_output_file(path: Path) -> None:
+    """Raise if a path cannot be an output file, before there is output.
+
+    Raises:
+        ManifestError: The path is a folder.
+    """
+    if path.is_dir():
+        raise ManifestError("is a folder", where=str(path), hint="name a file")
+
+
+def write_atomically(path: Path, text: str | Iterable[str]) -> None:
+    """Write a text file and create its folder; an existing file stays until the new one is complete.
+
+    The text may come in parts, which are written one after the other.
+
+    Raises:
+        ManifestError: The path is a folder.
+        SinkError: The file cannot be written.
+    """
+    check_output_file(path)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("w", encoding="utf-8") as file:
+            file.writelines([text] if isinstance(text, str) else text)
+        partial.replace(path)
+    except OSError as error:
+        with suppress(OSError):
+            partial.unlink()
+        raise SinkError(f"cannot be written: {error.strerror}", where=str(path)) from error
 
 
 def schema_of(
@@ -44,9 +105,6 @@ def document_schema(model: type[BaseModel]) -> dict[str, Any]:
         if computed:
             part["required"] = [name for name in part["required"] if name not in computed]
     return {"$schema": DIALECT, **schema}
-
-
-_Model = TypeVar("_Model", bound=BaseModel)
 
 
 def read_document(content: bytes, model: type[_Model], *, where: str, kind: str, hint: str) -> _Model:
@@ -176,3 +234,29 @@ def _encodable(value: Any) -> Any:  # noqa: ANN401 - every field of every part
     if isinstance(value, tuple):
         return tuple(escape_undecodable(item) if type(item) is str else item for item in value)
     return value
+
+
+def html_table(
+    caption: str,
+    names: Sequence[str],
+    rows: Iterable[Sequence[str]],
+    *,
+    count: int,
+    numbers: Collection[str] = (),
+    notes: Sequence[str] = (),
+) -> str:
+    """Return a table of escaped text with at most `MAX_ROWS` of `count` rows; columns in `numbers` are right-aligned."""
+    aligned = [
+        " style='text-align:right'" if name in numbers else " style='text-align:left'" for name in names
+    ]
+    head = "".join(f"<th{style}>{escape(name)}</th>" for name, style in zip(names, aligned, strict=True))
+    body = "".join(
+        "<tr>"
+        + "".join(f"<td{style}>{escape(cell)}</td>" for cell, style in zip(row, aligned, strict=True))
+        + "</tr>"
+        for row in islice(rows, MAX_ROWS)
+    )
+    more = [f"… and {count - MAX_ROWS:,} more"] if count > MAX_ROWS else []
+    lines = "".join(f"<p>{escape(line)}</p>" for line in (*more, *notes))
+    title = f"<caption style='text-align:left'><b>{escape(caption)}</b></caption>"
+    return f"<table>{title}<thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>{lines}"

@@ -1,14 +1,19 @@
-"""Sequences whose elements are computed at each access."""
+"""Values that are computed when they are needed: lazy sequences, and results cached by identity."""
 
 from __future__ import annotations
 
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
+from threading import Lock
 from typing import Generic, TypeVar, overload
 
 T = TypeVar("T")
 U = TypeVar("U")
+_Argument = TypeVar("_Argument")
+_Result = TypeVar("_Result")
+_MAX_ENTRIES = 256
+"""Maximum number of cached results. Successive recordings have the same topics, so they share most results."""
 
 
 class LazySequence(Sequence[T], Generic[T]):
@@ -63,3 +68,27 @@ def concatenate(parts: Sequence[LazySequence[T]]) -> LazySequence[T]:
         return parts[part][position - starts[part]]
 
     return LazySequence(compute, range(starts[-1]), [sample for part in parts for sample in part.samples])
+
+
+def cache_by_identity(function: Callable[[_Argument], _Result]) -> Callable[[_Argument], _Result]:
+    """Cache the results of a function by the identity of its argument, and evict the oldest; use it as a decorator.
+
+    It is for arguments that are as expensive to hash as the result is to compute, such as Arrow types and schemas, which
+    are hashed by their text. `functools.lru_cache` would hash them, and `cachetools.cached(key=id)` would not keep them
+    alive, so ids could be reused.
+    """
+    # Each entry contains its argument: while the argument is alive, no other object has its id.
+    entries: dict[int, tuple[_Argument, _Result]] = {}
+    lock = Lock()
+
+    def cached(argument: _Argument) -> _Result:
+        entry = entries.get(id(argument))
+        if entry is None:
+            entry = (argument, function(argument))
+            with lock:
+                while len(entries) >= _MAX_ENTRIES:
+                    del entries[next(iter(entries))]
+                entries[id(argument)] = entry
+        return entry[1]
+
+    return cached

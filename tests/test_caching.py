@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mosaico_ingest.caching import cache_by_identity
+from mosaico_ingest.lazy import cache_by_identity
 
 
 class _AlwaysEqual:

@@ -17,8 +17,8 @@ import pytest
 import mosaico_ingest
 from mosaico_ingest import Store
 from mosaico_ingest.destinations.store import SequenceInfo, TopicInfo
+from mosaico_ingest.documents import html_table
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
-from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.files import RunReport
 
 ROOT = Path(__file__).resolve().parents[1]

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.job.patterns import first_match, select
+from mosaico_ingest.job.values import first_match, select
 
 TOPICS = ("/imu", "/tf", "/cam/left", "/cam/right", "/cam/debug/left")
 

@@ -32,13 +32,12 @@ from mosaico_ingest.adapters.python import (
     is_adapter_class,
     registered_adapters,
 )
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.job.adapter_reference import ParameterizedAdapter
-from mosaico_ingest.job.image import ImageFormat, ImageSettings, image_settings
-from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.fields import ImageFormat, ImageSettings, ParameterizedAdapter, image_settings
+from mosaico_ingest.job.values import first_match
 from mosaico_ingest.ontology.types import SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
-from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job

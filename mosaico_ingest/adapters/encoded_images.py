@@ -17,7 +17,7 @@ from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.images.encode import EncodedImage, encode_image
 from mosaico_ingest.images.encodings import RawImage
 from mosaico_ingest.images.files import require_pillow
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.ontology.types import OntologyType
 
 IMAGE_METADATA_KEY = "_image_"

@@ -7,7 +7,7 @@ from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
 from mosaico_ingest.errors import AdapterError, ViewError
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.rosbag.definitions.model import Definition
 
 IMAGE_TAG = "Image"

@@ -145,7 +145,7 @@ def _opened(
 
 def _instant_ns(option: str, text: str | None, source: SourceSequence) -> int | None:
     """Return ns since the epoch; `+` counts from the first message, `-` back from the last."""
-    from mosaico_ingest.job.units import parse_instant, parse_offset
+    from mosaico_ingest.job.values import parse_instant, parse_offset
 
     if text is None:
         return None

@@ -113,7 +113,7 @@ def write_output(path: Path, text: str | Iterable[str], *, announce: bool = Fals
     Raises:
         SinkError: The file cannot be written.
     """
-    from mosaico_ingest.textfile import write_atomically
+    from mosaico_ingest.documents import write_atomically
 
     if path == STANDARD_OUTPUT:
         sys.stdout.writelines([text] if isinstance(text, str) else text)

@@ -27,7 +27,7 @@ from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.units import bytes_text, counted, seconds_text, time_text
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.expand import Expanded
+    from mosaico_ingest.job.reference import Expanded
     from mosaico_ingest.pipeline.plan_document import (
         DestinationState,
         Difference,
@@ -267,7 +267,7 @@ def expand(manifest: ManifestArgument, as_json: JsonOption = False) -> None:
 
     Environment variables are not replaced. A comment shows the location of a value from another file.
     """
-    from mosaico_ingest.job.expand import expand_manifest, to_yaml
+    from mosaico_ingest.job.reference import expand_manifest, to_yaml
 
     jobs = expand_manifest(manifest)
     if as_json:

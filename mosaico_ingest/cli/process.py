@@ -87,7 +87,7 @@ class _NoPandas:
 
 
 def _uses_python_adapters(job: Job) -> bool:
-    from mosaico_ingest.job.adapter_reference import reference_of
+    from mosaico_ingest.job.fields import reference_of
 
     references = map(reference_of, (*job.adapters.load, *job.adapters.override.values()))
     return any(not str(reference).endswith((".yaml", ".yml")) for reference in references)

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal
 from mosaico_ingest.cli.logs import json_line
-from mosaico_ingest.executors.groups import source_bytes
+from mosaico_ingest.executors.base import source_bytes
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.events import (
     BatchObserver,

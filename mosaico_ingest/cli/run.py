@@ -75,7 +75,7 @@ class _ResultFiles(Struct, frozen=True):
 
     def check(self) -> None:
         """Raise ManifestError if one of the paths is a folder."""
-        from mosaico_ingest.textfile import check_output_file
+        from mosaico_ingest.documents import check_output_file
 
         for file in (self.metrics, self.junit, self.sarif):
             if file is not None and file != STANDARD_OUTPUT:
@@ -362,8 +362,8 @@ def run_tasks(
         typer.Exit: The exit code is not 0.
     """
     from mosaico_ingest import api
+    from mosaico_ingest.documents import check_output_file
     from mosaico_ingest.executors.base import choose_executor
-    from mosaico_ingest.textfile import check_output_file
 
     as_json = log_format is LogFormat.JSON
     level = log or ("ERROR" if quiet else tasks[0].job.run.log_level if tasks else "INFO")

@@ -146,7 +146,7 @@ def write_schemas(documents: Sequence[Document], write: Path | None, check: Path
     Raises:
         typer.Exit: A schema is not up to date.
     """
-    from mosaico_ingest.textfile import write_atomically
+    from mosaico_ingest.documents import write_atomically
 
     stale = 0
     for each in documents:

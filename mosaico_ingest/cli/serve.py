@@ -202,7 +202,7 @@ def list_keys(api_keys: KeyFileOption = DEFAULT_KEY_FILE) -> None:
 
 
 def _size(text: str, option: str) -> int:
-    from mosaico_ingest.job.units import parse_size
+    from mosaico_ingest.job.values import parse_size
 
     try:
         return parse_size(text)

@@ -174,7 +174,7 @@ def open_topic(store: str, path: str) -> TopicInfo:
 
 def time_option(info: TopicInfo | SequenceInfo, text: str, *, option: str = "--at") -> int:
     """Return the ns of an option: nanoseconds, an instant, or an offset from the start (`+`) or the end (`-`)."""
-    from mosaico_ingest.job.units import parse_time
+    from mosaico_ingest.job.values import parse_time
 
     if text.isdecimal() and len(text) < 20:  # noqa: PLR2004 - the digits of 64 bits
         return int(text)

@@ -68,7 +68,7 @@ def _selected(info: SequenceInfo, topics: list[str] | None) -> SequenceInfo:
     from msgspec.structs import replace
 
     from mosaico_ingest.errors import NothingMatched
-    from mosaico_ingest.job.patterns import select
+    from mosaico_ingest.job.values import select
 
     if not topics:
         return info

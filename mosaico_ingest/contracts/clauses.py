@@ -23,8 +23,7 @@ from mosaico_ingest.job.expect import (
     Limit as LimitExpectation,
 )
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.job.units import format_time
-from mosaico_ingest.job.values import Limit, TimeBound
+from mosaico_ingest.job.values import Limit, TimeBound, format_time
 from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
 from mosaico_ingest.report.units import count_text
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype

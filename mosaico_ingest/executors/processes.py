@@ -20,8 +20,7 @@ from msgspec import Struct, structs
 
 from mosaico_ingest.destinations.base import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
-from mosaico_ingest.executors.base import InProcess, do_nothing
-from mosaico_ingest.executors.batch import Batch, Registrations
+from mosaico_ingest.executors.base import Batch, InProcess, Registrations, do_nothing
 from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.memory import MemoryBudget

@@ -13,7 +13,7 @@ from msgspec import Struct
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.images.encodings import RawImage, Samples, eight_bits, has_colors, raw_samples
 from mosaico_ingest.images.files import file_samples, jpeg_file, png_file, resized
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 
 _RGB = 3
 _MAX_DEPTH = 0xFFFF

@@ -12,7 +12,7 @@ from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.job.adapter_reference import AdapterReference
+from mosaico_ingest.job.fields import AdapterReference
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import (
     DEFAULT_PORT,

@@ -11,10 +11,13 @@ from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import AfterValidator, Discriminator, Field, Tag, WithJsonSchema
 
-from mosaico_ingest.job.fields import Parsed, TopicGlob
-from mosaico_ingest.job.patterns import first_match
-from mosaico_ingest.job.section import MessageLimit, Section, Text, Topic, shape_of
-from mosaico_ingest.job.units import (
+from mosaico_ingest.job.fields import MessageLimit, Parsed, Section, Text, Topic, TopicGlob, shape_of
+from mosaico_ingest.job.values import (
+    RECORDING,
+    Interval,
+    OnFailure,
+    TimeBound,
+    first_match,
     format_duration,
     format_time,
     parse_duration,
@@ -23,7 +26,6 @@ from mosaico_ingest.job.units import (
     parse_rate,
     parse_share,
 )
-from mosaico_ingest.job.values import RECORDING, Interval, OnFailure, TimeBound
 
 _MAX_COUNT = 10**15
 

@@ -1,4 +1,4 @@
-"""Annotations that describe the fields of a job, and functions that find and change annotated fields.
+"""Annotations of manifest fields, functions that find and change annotated fields, and the types that sections share.
 
 `extends`, lint, the removal of secrets, shipping to a cluster, JSON Schema and docs/manifest.md are derived from these
 annotations, so a new key needs no entry in a list.
@@ -9,16 +9,35 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from enum import Enum
 from functools import cache
-from typing import Annotated, Any, TypeAlias, get_args, get_origin
+from typing import Annotated, Any, Literal, TypeAlias, get_args, get_origin
 
 from msgspec import Struct
-from pydantic import BaseModel, GetCoreSchemaHandler, GetJsonSchemaHandler
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Discriminator,
+    Field,
+    GetCoreSchemaHandler,
+    GetJsonSchemaHandler,
+    StringConstraints,
+    Tag,
+    model_validator,
+)
 from pydantic.json_schema import JsonSchemaValue
-from pydantic_core import CoreSchema, core_schema
+from pydantic_core import CoreSchema, PydanticCustomError, core_schema
+from typing_extensions import Self
+
+from mosaico_ingest.job.values import Limit, TimeBound, format_time, parse_limit, parse_time
 
 PathPattern: TypeAlias = tuple["str | None", ...]
 """A key path in which `ANY` stands for every key of a mapping or position in a list."""
 ANY = None
+_MAX_COUNT = 1_000_000_000
+ParameterValue = bool | int | float | str | None
+ImageFormat = Literal["raw", "png", "jpeg", "buffer_png"]
+"""The formats of stored images."""
+_FORMATS = {"quality": ("jpeg",), "max_width": ("png", "jpeg"), "depth_unit": ("png",)}
+"""The formats that each key affects."""
 
 
 class PathRole(Enum):
@@ -217,3 +236,104 @@ def replace_values(
     if isinstance(value, Mapping):
         return {**value, **new_children}
     return type(value)(new_children.values())
+
+
+def shape_of(value: Any) -> str:  # noqa: ANN401 - any YAML value
+    """Return the tag of a value in a union: `several` for a list or mapping, otherwise `one`."""
+    return "several" if isinstance(value, list | tuple | dict) else "one"
+
+
+def _limit_to_json(limit: Limit) -> int | float | None:
+    return limit.count if limit.share is None else limit.share
+
+
+Text = Annotated[str, StringConstraints(min_length=1)]
+Count = Annotated[int, Field(ge=1, le=_MAX_COUNT)]
+Time = Annotated[
+    TimeBound,
+    Parsed(
+        parse_time, r"^([+-][0-9.]+ ?(ns|us|ms|s|min|h)|[0-9]{4}-[0-9]{2}-[0-9]{2}.*)$", to_json=format_time
+    ),
+]
+MessageLimit = Annotated[
+    Limit,
+    Parsed(
+        parse_limit,
+        r"^[0-9]+$|^0*(100(\.0*)?|[0-9]{1,2}(\.[0-9]+)?) ?%$",
+        whole_numbers=True,
+        to_json=_limit_to_json,
+    ),
+]
+Topic = Annotated[Text, TopicGlob()]
+
+
+class Section(BaseModel):
+    """A section of a manifest: a mapping with defined keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
+
+    def replace(self, **changes: Any) -> Self:  # noqa: ANN401 - the types of the fields
+        """Return a copy with other values, which are not validated."""
+        return self.model_copy(update=changes)
+
+
+AdapterReference = Annotated[Any, AdapterRef()]
+"""An adapter: in manifests a text, in Python also a class or an `AdapterSpec`."""
+
+
+class ParameterizedAdapter(Section):
+    """An adapter file with values of its parameters."""
+
+    file: AdapterReference
+    """The path of the adapter file."""
+    values: dict[Text, ParameterValue] = Field(alias="with", examples=[{"cells": 12}])
+    """Parameter → value; parameters that are not listed have the default that the file declares."""
+
+    def __str__(self) -> str:
+        """Return the path of the file."""
+        return str(self.file)
+
+
+LoadedAdapter = Annotated[
+    Annotated[AdapterReference, Tag("one")] | Annotated[ParameterizedAdapter, Tag("several")],
+    Discriminator(shape_of),
+]
+"""An adapter, with or without values of its parameters."""
+
+
+def reference_of(adapter: object) -> Any:  # noqa: ANN401 - what `AdapterReference` accepts
+    """Return the reference of an entry in `adapters.load`."""
+    return adapter.file if isinstance(adapter, ParameterizedAdapter) else adapter
+
+
+class ImageSettings(Section):
+    """The format of stored raw images. Compressed images and video keep their bytes."""
+
+    format: ImageFormat = "raw"
+    """The format: `raw` (as recorded), `png` (a lossless picture), `jpeg`, or `buffer_png` (the bytes of the image as a gray PNG,
+    for every encoding, as the official bridge stores them)."""
+    quality: Annotated[int, Field(ge=1, le=100)] = 90
+    """The quality of JPEG files, from 1 to 100."""
+    max_width: Count | None = Field(default=None, examples=[1280])
+    """The maximum width in pixels; wider images are scaled down and keep their proportions."""
+    depth_unit: Annotated[float, Field(gt=0, le=1)] = 0.001
+    """The step in meters at which `png` stores depth images of floating-point numbers in 16 bits."""
+
+    def used(self) -> dict[str, Any]:
+        """Return the settings that are set and that affect the format."""
+        values = {key: getattr(self, key) for key, formats in _FORMATS.items() if self.format in formats}
+        return {"format": self.format, **{key: value for key, value in values.items() if value is not None}}
+
+    @model_validator(mode="after")
+    def _check_format(self) -> ImageSettings:
+        for key, formats in _FORMATS.items():
+            if key in self.model_fields_set and self.format not in formats:
+                names = " or ".join(formats)
+                message = f"{key} requires format: {names}, but format is {self.format}"
+                raise PydanticCustomError("conflicting-keys", "{message}", {"key": key, "message": message})
+        return self
+
+
+def image_settings(value: ImageSettings | ImageFormat) -> ImageSettings:
+    """Return the settings of `topic_settings.<topic>.image`, which may be only a format."""
+    return ImageSettings(format=value) if isinstance(value, str) else value

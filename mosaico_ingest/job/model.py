@@ -30,15 +30,26 @@ from typing_extensions import Self
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.findings import Span
-from mosaico_ingest.job.adapter_reference import LoadedAdapter
 from mosaico_ingest.job.expect import Duration, Expectations, Frequency, SignedDuration
-from mosaico_ingest.job.fields import FilePath, Literally, Parsed, PathRole, Secret, TopicGlob
-from mosaico_ingest.job.file_names import FileNamePattern
-from mosaico_ingest.job.image import ImageFormat, ImageSettings
-from mosaico_ingest.job.patterns import first_match, is_glob
-from mosaico_ingest.job.section import Count, MessageLimit, Section, Text, Time, Topic, shape_of
+from mosaico_ingest.job.fields import (
+    Count,
+    FilePath,
+    ImageFormat,
+    ImageSettings,
+    Literally,
+    LoadedAdapter,
+    MessageLimit,
+    Parsed,
+    PathRole,
+    Secret,
+    Section,
+    Text,
+    Time,
+    Topic,
+    TopicGlob,
+    shape_of,
+)
 from mosaico_ingest.job.split import SequencePart, SplitSettings
-from mosaico_ingest.job.units import parse_size
 from mosaico_ingest.job.values import (
     DEFAULT_MESSAGE_BYTES,
     DEFAULT_PORT,
@@ -46,6 +57,7 @@ from mosaico_ingest.job.values import (
     DEFAULT_TOPIC,
     PROVENANCE_KEY,
     Compression,
+    FileNamePattern,
     IfExists,
     LoaderErrorPolicy,
     LockFile,
@@ -59,6 +71,9 @@ from mosaico_ingest.job.values import (
     Target,
     TopicLevelErrorPolicy,
     Unmodeled,
+    first_match,
+    is_glob,
+    parse_size,
 )
 from mosaico_ingest.protocol import check_metadata, check_sequence_name, check_topic_name
 from mosaico_ingest.remote import AnyPath, Network, RemotePath, as_path, with_network

@@ -17,13 +17,20 @@ from msgspec import Struct
 from pydantic import ValidationError
 from pydantic_core import ErrorDetails
 
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.findings import Edit, Finding, Span
-from mosaico_ingest.job.adapter_reference import reference_of
-from mosaico_ingest.job.compose import combinations, fill_in
-from mosaico_ingest.job.events import Event, EventFile, overlaps, read_events
-from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, TopicGlob, marked_fields, values_at
-from mosaico_ingest.job.manifest import check_manifest
+from mosaico_ingest.job.fields import (
+    AdapterRef,
+    FilePath,
+    PathRole,
+    TopicGlob,
+    marked_fields,
+    reference_of,
+    values_at,
+)
+from mosaico_ingest.job.manifest import check_manifest, combinations, fill_in
 from mosaico_ingest.job.model import JobSettings, Manifest
+from mosaico_ingest.job.split import Event, EventFile, overlaps, read_events
 from mosaico_ingest.job.validation import key_path_of
 from mosaico_ingest.job.values import Stores, TimeBound
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
@@ -31,7 +38,6 @@ from mosaico_ingest.remote import without_options
 from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 from mosaico_ingest.rules import RULES
-from mosaico_ingest.textfile import read_limited
 
 _PLACEHOLDER = "missing"
 """Stands for a missing required string, so that the rest of the manifest can be checked."""

@@ -22,11 +22,11 @@ from mosaico_ingest.contracts.rows import (
     syntax_findings,
     type_findings,
 )
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError, BagError, ManifestError
 from mosaico_ingest.findings import Edit, Finding, Severity, Span, mask_credentials
-from mosaico_ingest.job.compose import EXTENDS_KEY, bases_of, extended
 from mosaico_ingest.job.expect import AllowedNames, Expectations, TopicExpectations
-from mosaico_ingest.job.manifest import read_text
+from mosaico_ingest.job.manifest import EXTENDS_KEY, bases_of, extended, read_text
 from mosaico_ingest.job.yaml_source import load_source
 from mosaico_ingest.lint.check import Job, MessageFile, read_job, read_message
 from mosaico_ingest.lint.documents import Document, Kind, documents_in, files_below, looks_like_ours
@@ -35,7 +35,6 @@ from mosaico_ingest.lint.settings import Settings, apply_ignores, ignores_in, se
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver, definition_files
-from mosaico_ingest.textfile import read_limited
 
 STDIN = "-"
 """The path that stands for the text of `stdin`."""

@@ -13,8 +13,8 @@ from msgspec.structs import replace
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span, join_names, nearest
-from mosaico_ingest.job.file_names import FileNamePattern
 from mosaico_ingest.job.model import Job, Origin
+from mosaico_ingest.job.values import FileNamePattern
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 from mosaico_ingest.metadata.validation import load_schema, read_json, with_required_types
 from mosaico_ingest.remote import AnyPath

@@ -13,7 +13,7 @@ import pyarrow.compute as pc
 import pyarrow.types as pt
 from msgspec import Struct
 
-from mosaico_ingest.caching import cache_by_identity
+from mosaico_ingest.lazy import cache_by_identity
 
 PLAIN_TYPES: Mapping[pa.DataType, pa.DataType] = {
     pa.large_string(): pa.string(),

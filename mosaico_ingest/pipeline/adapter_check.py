@@ -12,7 +12,7 @@ from mosaico_ingest.adapters.mapping.loader import MappingSpec, parameter_proble
 from mosaico_ingest.adapters.permission import is_python_allowed, is_python_reference, python_refusal
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.adapter_reference import ParameterizedAdapter, reference_of
+from mosaico_ingest.job.fields import ParameterizedAdapter, reference_of
 from mosaico_ingest.job.manifest import refusal
 from mosaico_ingest.job.model import Job
 

@@ -16,15 +16,14 @@ from typing import Any
 from msgspec import Struct
 
 from mosaico_ingest.containers import RECORDING_NAME
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.compose import PLACEHOLDERS, Placeholder, placeholders_in
 from mosaico_ingest.job.fields import FilePath, PathRole, marked_fields, replace_values
-from mosaico_ingest.job.file_names import FileNamePattern
-from mosaico_ingest.job.impossible_patterns import pattern_problems
-from mosaico_ingest.job.manifest import LoadedManifest, refusal
+from mosaico_ingest.job.manifest import PLACEHOLDERS, LoadedManifest, Placeholder, placeholders_in, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Manifest, Origin, SequenceSettings
-from mosaico_ingest.job.values import LOCK_SUFFIX, LockFile
+from mosaico_ingest.job.validation import pattern_problems
+from mosaico_ingest.job.values import LOCK_SUFFIX, FileNamePattern, LockFile
 from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.metadata.sources import source_spans, with_spans
@@ -33,7 +32,6 @@ from mosaico_ingest.protocol import is_sequence_name
 from mosaico_ingest.remote import AnyPath, RemotePath, with_network, without_options
 from mosaico_ingest.rosbag.discovery import recording_files
 from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits, has_split_number
-from mosaico_ingest.textfile import read_limited
 
 _READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")

@@ -28,7 +28,7 @@ from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.job.patterns import first_match
+from mosaico_ingest.job.values import first_match
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.rosbag.blocks import Connection
 from mosaico_ingest.rosbag.definitions.model import Definition

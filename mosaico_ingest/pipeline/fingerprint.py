@@ -19,10 +19,10 @@ from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of, registered_adapters
-from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.job.adapter_reference import reference_of
+from mosaico_ingest.job.fields import reference_of
 from mosaico_ingest.job.model import Job, JobSettings
+from mosaico_ingest.lazy import cache_by_identity
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, definition_files
 from mosaico_ingest.rosbag.discovery import FILE_NAME

@@ -17,12 +17,11 @@ from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.destinations.base import destination_of
-from mosaico_ingest.documents import Part, Unchecked
+from mosaico_ingest.documents import Part, Unchecked, html_table
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSettings
 from mosaico_ingest.job.split import SequencePart
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
-from mosaico_ingest.notebook import html_table
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.task import Attempt

@@ -14,13 +14,20 @@ from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
-from mosaico_ingest.job.fields import TopicGlob, marked_fields, values_at
-from mosaico_ingest.job.file_names import FileNamePattern
-from mosaico_ingest.job.image import image_settings
+from mosaico_ingest.job.fields import TopicGlob, image_settings, marked_fields, values_at
 from mosaico_ingest.job.model import Job, JobSettings
-from mosaico_ingest.job.patterns import Selection, first_match, select
-from mosaico_ingest.job.units import format_time
-from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, StampSource, TimeBound, Unmodeled
+from mosaico_ingest.job.values import (
+    FileNamePattern,
+    IfExists,
+    LoaderErrorPolicy,
+    Selection,
+    StampSource,
+    TimeBound,
+    Unmodeled,
+    first_match,
+    format_time,
+    select,
+)
 from mosaico_ingest.pipeline.attachments import kept_content
 from mosaico_ingest.pipeline.latched import is_static
 from mosaico_ingest.pipeline.memory import MemoryBudget

@@ -25,8 +25,7 @@ from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.job.patterns import first_match
-from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy
+from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy, first_match
 from mosaico_ingest.pipeline.contract import attach_monitor, monitor_of
 from mosaico_ingest.pipeline.contract_group import results_by_job
 from mosaico_ingest.pipeline.contract_messages import index_results, sample_results

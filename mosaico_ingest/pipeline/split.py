@@ -17,12 +17,10 @@ from msgspec.structs import replace
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.events import Event, interval_finding, overlaps, read_events
 from mosaico_ingest.job.manifest import refusal
 from mosaico_ingest.job.model import Job, TopicSettings
-from mosaico_ingest.job.patterns import select
-from mosaico_ingest.job.split import SequencePart, clean_name
-from mosaico_ingest.job.values import StampSource
+from mosaico_ingest.job.split import Event, SequencePart, clean_name, interval_finding, overlaps, read_events
+from mosaico_ingest.job.values import StampSource, select
 from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import time_range
 from mosaico_ingest.pipeline.selection import Int64s, Mask, block_times

@@ -22,10 +22,9 @@ import msgspec
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, computed_field
 from typing_extensions import Self
 
-from mosaico_ingest.documents import document_schema, read_document
+from mosaico_ingest.documents import document_schema, html_table, read_document
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.lazy import LazySequence, concatenate
-from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ReportPart
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
 from mosaico_ingest.report.model import Report, Steps, topic_table

@@ -10,8 +10,8 @@ from urllib.parse import quote
 
 from pydantic import computed_field
 
+from mosaico_ingest.documents import html_table
 from mosaico_ingest.findings import Finding, Severity, Stage, one_line
-from mosaico_ingest.notebook import html_table
 from mosaico_ingest.report.contract import ContractResult, Location, ReportPart
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.timing import TimelineReport, mean_rate_hz

@@ -10,11 +10,11 @@ from typing import Any
 from msgspec import Struct
 
 from mosaico_ingest.containers import SUFFIX_LIST, SUFFIXES, ZSTD_SUFFIX
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.rosbag.opening import is_recording
-from mosaico_ingest.textfile import read_limited
 
 FILE_NAME = "metadata.yaml"
 _NO_CUSTOM_DATA = re.compile(r"^ *custom_data: *(~|null|\{\}) *$", re.MULTILINE)

@@ -16,8 +16,7 @@ from typing_extensions import Self
 
 from mosaico_ingest.errors import BagError, DecodeError, NothingMatched
 from mosaico_ingest.findings import Finding
-from mosaico_ingest.job.patterns import select
-from mosaico_ingest.job.values import LoaderErrorPolicy, Stores
+from mosaico_ingest.job.values import LoaderErrorPolicy, Stores, select
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock, ROSMessage, UnreadableRange
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver

@@ -23,7 +23,7 @@ from mosaico_ingest.contracts.rows import Evaluator, FieldExpression, bind_expre
 from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.job.expand import plain
+from mosaico_ingest.job.reference import plain
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.contract import monitor_of
 from mosaico_ingest.pipeline.opening import open_job

@@ -11,14 +11,12 @@ from pathlib import Path
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.builtin import BUILTIN
-from mosaico_ingest.documents import Part
+from mosaico_ingest.documents import Part, html_table
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import one_line
-from mosaico_ingest.job.expand import plain
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.job.patterns import select
-from mosaico_ingest.job.values import Stores
-from mosaico_ingest.notebook import html_table
+from mosaico_ingest.job.reference import plain
+from mosaico_ingest.job.values import Stores, select
 from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import plan_connection

@@ -18,6 +18,7 @@ from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
 from mosaico_ingest.adapters.mapping.inline_ontology import PLAIN_TYPES
 from mosaico_ingest.adapters.mapping.model import adapter_schema
 from mosaico_ingest.adapters.mapping.types import format_type, is_list
+from mosaico_ingest.documents import write_atomically
 from mosaico_ingest.errors import ContractError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
@@ -37,7 +38,6 @@ from mosaico_ingest.pipeline.definition_lock import (
 from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.task import Task
-from mosaico_ingest.textfile import write_atomically
 
 
 class WrittenLock(Struct, frozen=True):

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.findings import suggest_names
-from mosaico_ingest.job.units import parse_duration, parse_rate
+from mosaico_ingest.job.values import parse_duration, parse_rate
 
 TIME = "timestamp_ns"
 Int64s: TypeAlias = "NDArray[np.int64]"

@@ -20,7 +20,7 @@ from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.image import EncodedImageSpec, without_files
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.job.image import ImageFormat, ImageSettings
+from mosaico_ingest.job.fields import ImageFormat, ImageSettings
 from mosaico_ingest.pipeline.run import make_plan, run_recording
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.rosbag.definitions.model import Definition

@@ -16,7 +16,7 @@ PACKAGES = ("job", "rosbag", "decode", "protocol", "serve", "metadata", "adapter
 """The packages that process untrusted input."""
 INTERNAL = {
     "job.expect._MAX_COUNT": "a bound of a number",
-    "job.section._MAX_COUNT": "a bound of a number",
+    "job.fields._MAX_COUNT": "a bound of a number",
     "job.yaml_source._MAX_RECOVERIES": "number of reported mistakes",
     "rosbag.blocks.MAX_GROUP_LENGTH": "size of batches",
     "rosbag.blocks._MAX_WORD_BYTES": "the choice of an algorithm",

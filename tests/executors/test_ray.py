@@ -27,8 +27,7 @@ pytest.importorskip("ray", reason="Ray is not installed")
 from ray_cluster import two_nodes
 
 from mosaico_ingest.executors.processes import Registrations
-from mosaico_ingest.executors.ray import Ray
-from mosaico_ingest.executors.ray_worker import Setting, machine, out_of_reach
+from mosaico_ingest.executors.ray import Ray, Setting, machine, out_of_reach
 from mosaico_ingest.pipeline.task import Task
 
 pytestmark = pytest.mark.slow

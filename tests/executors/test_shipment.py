@@ -10,7 +10,7 @@ import pytest
 
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.executors.shipment import absolute, pack
+from mosaico_ingest.executors.ray import absolute, pack
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
 

@@ -17,7 +17,7 @@ from PIL import Image
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.images.encode import EncodedImage, decoded_buffer, encode_image
 from mosaico_ingest.images.encodings import RawImage
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 
 HEIGHT, WIDTH = 12, 18
 Pixels = npt.NDArray[Any]

@@ -27,7 +27,7 @@ from mosaico_ingest.adapters.builtin import (
 from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.python import ontology_of
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.job.image import ImageSettings
+from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

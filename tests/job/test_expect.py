@@ -11,14 +11,16 @@ from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.expect import Expectations
 from mosaico_ingest.job.manifest import load_manifest
-from mosaico_ingest.job.units import (
+from mosaico_ingest.job.values import (
+    Interval,
+    Limit,
+    OnFailure,
     format_duration,
     parse_duration,
     parse_interval,
     parse_rate,
     parse_share,
 )
-from mosaico_ingest.job.values import Interval, Limit, OnFailure
 
 ISSUE = """\
 bag: {path: drive.mcap}

@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.job.expand import expand_manifest, to_yaml
 from mosaico_ingest.job.manifest import load_manifest, load_manifests, read_manifest
+from mosaico_ingest.job.reference import expand_manifest, to_yaml
 from mosaico_ingest.job.yaml_source import Value, load_source
 
 BASE = """\

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.job.units import parse_instant, parse_offset, parse_size
+from mosaico_ingest.job.values import parse_instant, parse_offset, parse_size
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from mosaico_ingest.job.expand import MASK, manifest_text
+from mosaico_ingest.job.reference import MASK, manifest_text
 
 SECRETS = (
     "target: {host: h, api_key: hunter2}",

@@ -16,7 +16,7 @@ from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest import api
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
-from mosaico_ingest.executors.shipment import absolute, pack
+from mosaico_ingest.executors.ray import absolute, pack
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.lint.engine import lint_paths

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.job.file_names import FileNamePattern
+from mosaico_ingest.job.values import FileNamePattern
 
 TEXTS = st.text("abcXYZ019-", min_size=1, max_size=8)
 

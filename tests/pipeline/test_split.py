@@ -17,8 +17,7 @@ from stamped_messages import MESSAGES, SECOND, START_NS, Messages, write_stamped
 from mosaico_ingest import RosbagInjector, ROSInjectionConfig, api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.job.events import read_events
-from mosaico_ingest.job.split import SPLIT_KEY
+from mosaico_ingest.job.split import SPLIT_KEY, read_events
 from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.pipeline import provenance, split
 from mosaico_ingest.pipeline.topic import LATCHED_KEY

@@ -295,7 +295,7 @@ def test_run_interrupted_during_commit_finishes_it_unless_interrupted_twice(
 ) -> None:
     interrupt_commits(monkeypatch, signals=signals)
     monkeypatch.setattr("mosaico_ingest.destinations.store.destination._MAX_COMMITS", group)
-    monkeypatch.setattr("mosaico_ingest.executors.groups._MAX_S", 60.0)
+    monkeypatch.setattr("mosaico_ingest.executors.base._MAX_S", 60.0)
     configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("a", "b", "c")]
     reports = api.run(configs).recordings
     earlier = RunStatus.COMPLETED if signals == 1 else RunStatus.INTERRUPTED

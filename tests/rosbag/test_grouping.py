@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from made_recordings import define, record
 
 from mosaico_ingest import api
-from mosaico_ingest.job.file_names import FileNamePattern
+from mosaico_ingest.job.values import FileNamePattern
 from mosaico_ingest.rosbag.grouping import group_splits, numbering_gaps
 
 CORPUS = Path(__file__).parents[3] / "shared" / "corpus"

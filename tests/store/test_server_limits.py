@@ -20,7 +20,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.job.patterns import select
+from mosaico_ingest.job.values import select
 from mosaico_ingest.protocol.errors import Condition, as_flight_error, condition_of
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.serve import Keyring, Server, query, serve

@@ -28,12 +28,12 @@ from mosaico_ingest.adapters.mapping.functions.registry import suggest
 from mosaico_ingest.adapters.mapping.inline_ontology import inline_ontology_type
 from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile, RecordModel, Scalar, records_of
 from mosaico_ingest.adapters.mapping.types import ExprType
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, RowFailure, Severity
 from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
 from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.model import Definition, MessageType, normalize_msgtype
-from mosaico_ingest.textfile import read_limited
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source

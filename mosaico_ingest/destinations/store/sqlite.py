@@ -19,7 +19,6 @@ from threading import Lock
 import pyarrow as pa
 from xxhash import xxh3_128_hexdigest
 
-from mosaico_ingest.caching import cache_by_identity
 from mosaico_ingest.destinations.base import FamilyTopic
 from mosaico_ingest.destinations.store.model import (
     Listing,
@@ -29,6 +28,7 @@ from mosaico_ingest.destinations.store.model import (
     reason_incomplete,
 )
 from mosaico_ingest.job.values import PROVENANCE_KEY
+from mosaico_ingest.lazy import cache_by_identity
 
 BUSY_S = 30.0
 """Seconds that a call waits for other writers."""

@@ -6,10 +6,10 @@ import ast
 from collections.abc import Iterator
 from pathlib import Path
 
-from mosaico_ingest.job.adapter_reference import reference_of
+from mosaico_ingest.documents import read_limited
+from mosaico_ingest.job.fields import reference_of
 from mosaico_ingest.lint.check import Check, Job, Problem, find_module, load_mapping_source, python_reference
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
-from mosaico_ingest.textfile import read_limited
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any, cast
 
 from mosaico_ingest.adapters.mapping.loader import parameter_problem
-from mosaico_ingest.job.adapter_reference import ParameterizedAdapter
+from mosaico_ingest.job.fields import ParameterizedAdapter
 from mosaico_ingest.lint.check import Check, Job, Problem, load_mapping_source
 
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.units import format_time
-from mosaico_ingest.job.values import TimeBound
+from mosaico_ingest.job.values import TimeBound, format_time
 from mosaico_ingest.lint.check import Check, Job, Problem
 
 

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from typing import Any
 
 from mosaico_ingest.job.expect import Expectation, FieldExpectations
-from mosaico_ingest.job.section import Section
+from mosaico_ingest.job.fields import Section
 from mosaico_ingest.lint.check import Check, Job, Problem
 
 _BOUNDS = (("min", "max"), ("after", "before"))

@@ -9,7 +9,7 @@ from typing import Any
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Manifest, combined_settings
-from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.job.values import is_glob
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 from mosaico_ingest.lint.check import Check, Job, Problem, manifests_of_matrix
 from mosaico_ingest.metadata.sources import source_spans

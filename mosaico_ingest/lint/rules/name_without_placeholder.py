@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.compose import placeholders_in
-from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.job.manifest import placeholders_in
+from mosaico_ingest.job.values import is_glob
 from mosaico_ingest.lint.check import Check, Job, Problem
 from mosaico_ingest.remote import without_options
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.job.values import is_glob
 from mosaico_ingest.lint.check import Check, Job, Problem
 
 

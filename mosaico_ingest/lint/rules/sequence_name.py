@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterator
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.job.compose import placeholders_in
+from mosaico_ingest.job.manifest import placeholders_in
 from mosaico_ingest.lint.check import Check, Job, Problem
 from mosaico_ingest.protocol import check_sequence_name
 

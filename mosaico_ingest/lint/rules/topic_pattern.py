@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.job.impossible_patterns import pattern_problems
+from mosaico_ingest.job.validation import pattern_problems
 from mosaico_ingest.lint.check import Check, Job, Problem
 
 

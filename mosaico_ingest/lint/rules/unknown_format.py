@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from mosaico_ingest.containers import RECORDING_NAME, SUFFIX_LIST
-from mosaico_ingest.job.patterns import is_glob
+from mosaico_ingest.job.values import is_glob
 from mosaico_ingest.lint.check import Check, Job, Problem, recording_paths
 
 

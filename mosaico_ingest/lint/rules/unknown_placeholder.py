@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.findings import nearest
-from mosaico_ingest.job.compose import PLACEHOLDERS, placeholders_in
+from mosaico_ingest.job.manifest import PLACEHOLDERS, placeholders_in
 from mosaico_ingest.lint.check import Check, Job, Problem
 
 

@@ -12,6 +12,7 @@ from typing import Any, ClassVar
 
 from msgspec import Struct
 
+from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import BagError, DefinitionError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.values import Stores
@@ -34,7 +35,6 @@ from mosaico_ingest.rosbag.definitions.model import (
     normalize_msgtype,
 )
 from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, RepeatedFieldError, flatten, read_types
-from mosaico_ingest.textfile import read_limited
 
 _SUFFIXES = (".msg", ".idl")
 
