@@ -114,7 +114,7 @@ def compile_job(manifest: Path, *, locked: bool = True) -> LazySequence[Job]:
     jobs = compile_manifests(load_manifests(manifest), locked=locked)
     for adapters, group in groupby(jobs.samples, key=lambda job: job.adapters):
         if adapters.load or adapters.override:
-            from mosaico_ingest.pipeline.adapter_check import check_adapters
+            from mosaico_ingest.pipeline.compile import check_adapters
 
             check_adapters(next(group))
     return jobs
@@ -325,10 +325,10 @@ def run(
         jobs = compile_job(Path(jobs))
     tasks = _tasks(jobs)
     if any(task.job.expect is not None and task.job.expect.group is not None for task in tasks.samples):
-        from mosaico_ingest.pipeline.contract_group import add_group_results
+        from mosaico_ingest.pipeline.contract_check import add_group_results
 
         tasks = LazySequence.of(add_group_results(tasks))
-    from mosaico_ingest.pipeline.known import mark_known
+    from mosaico_ingest.pipeline.provenance import mark_known
 
     if executor is None:
         from mosaico_ingest.executors.base import choose_executor

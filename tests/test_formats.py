@@ -14,7 +14,7 @@ from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.catalog import FORMAT
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
-from mosaico_ingest.pipeline.definition_lock import LockFile, read_lock
+from mosaico_ingest.pipeline.definition_changes import LockFile, read_lock
 from mosaico_ingest.pipeline.plan_document import read_plan
 from mosaico_ingest.report.files import read_report
 from mosaico_ingest.serve.keys import Keyring

@@ -162,7 +162,7 @@ def write_schemas(documents: Sequence[Document], write: Path | None, check: Path
 
 
 def _schema_text(document: Document) -> str:
-    from mosaico_ingest.pipeline.definition_lock import lock_schema
+    from mosaico_ingest.pipeline.definition_changes import lock_schema
     from mosaico_ingest.pipeline.plan_document import plan_schema
     from mosaico_ingest.report.files import report_schema
     from mosaico_ingest.services.schemas import adapter_editor_schema, job_editor_schema

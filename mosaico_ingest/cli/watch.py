@@ -175,7 +175,7 @@ def _ingest(
     recordings of the folder. Return False if the run was interrupted.
     """
     from mosaico_ingest.executors.processes import Processes
-    from mosaico_ingest.pipeline.contract_group import add_group_results
+    from mosaico_ingest.pipeline.contract_check import add_group_results
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.events import RunStatus, ignore_batch
 

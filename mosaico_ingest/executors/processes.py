@@ -23,9 +23,8 @@ from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.executors.base import Batch, InProcess, Registrations, do_nothing
 from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.run import failed_report
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import MemoryBudget, Task
 from mosaico_ingest.report.events import BatchObserver, Event
 from mosaico_ingest.report.model import Report
 

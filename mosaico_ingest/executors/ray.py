@@ -32,9 +32,8 @@ from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.metadata.validation import schema_files
-from mosaico_ingest.pipeline.memory import DEFAULT_BYTES
 from mosaico_ingest.pipeline.run import failed_report, run_recording
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import DEFAULT_BYTES, Task
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, RunStarted
 from mosaico_ingest.report.model import Report

@@ -9,7 +9,7 @@ from mosaico_ingest.destinations.store.model import AttachmentInfo
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.export.sources import SourceSequence
 from mosaico_ingest.findings import join_names
-from mosaico_ingest.pipeline.attachments import CUSTOM_DATA_KEY, RECORDS_KEY
+from mosaico_ingest.job.values import CUSTOM_DATA_KEY, RECORDS_KEY
 from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.writers import AttachmentWriter, RecordingWriter
 

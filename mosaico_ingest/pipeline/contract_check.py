@@ -1,19 +1,22 @@
-"""The check of a recording against its data contract, without a run: by its index if log times decide the contract."""
+"""Data contracts without a run: the check of a recording by its log times, and of groups of recordings before any is ingested."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import defaultdict
+from collections.abc import Callable, Mapping, Sequence
+
+from msgspec import structs
 
 from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract, ReadTopic
+from mosaico_ingest.contracts.evaluate import Member, group_results
 from mosaico_ingest.contracts.monitor import RecordingMonitor
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled
-from mosaico_ingest.pipeline.opening import open_job
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.blocks import Int64s
-from mosaico_ingest.rosbag.recording import Recording
+from mosaico_ingest.rosbag.recording import Recording, time_bounds
 
 WHOLE_FILE_KEYS = frozenset({"unreadable", "chunk_crcs"})
 """Expectations of the recording that require reading every chunk."""
@@ -38,7 +41,7 @@ def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> Contr
         has_definitions = all(one.definition is not None for one in recording.connections)
         if has_definitions and needs_times_only(job):
             return _check_times(contract, recording)
-        from mosaico_ingest.pipeline.contract_messages import check_messages  # noqa: PLC0415 - log times need no decoder
+        from mosaico_ingest.pipeline.contract import check_messages  # noqa: PLC0415 - log times need no decoder
 
         return check_messages(Task(job, group=group), recording, resolver)
 
@@ -85,3 +88,46 @@ def add_times(monitor: RecordingMonitor, times: Mapping[int, Int64s]) -> None:
         observer = monitor.observer(key)
         if observer is not None:
             observer.block(of_connection)
+
+
+def add_group_results(tasks: Sequence[Task], present: Callable[[], Sequence[Job]] = tuple) -> list[Task]:
+    """Return the tasks with the results of the expectations of their groups.
+
+    `present` returns the jobs of further recordings of the groups; it is only called if a group has expectations.
+    """
+    jobs = [task.job for task in tasks]
+    if any(job.expect is not None and job.expect.group is not None for job in jobs):
+        jobs += present()
+    results = results_by_job(jobs)
+    return [
+        structs.replace(task, group=results[position]) if position in results else task
+        for position, task in enumerate(tasks)
+    ]
+
+
+def results_by_job(jobs: Sequence[Job]) -> dict[int, tuple[ExpectationResult, ...]]:
+    """Return the results of the group of each job, by position, for the jobs that have expectations of their group."""
+    groups: dict[tuple[object, ...], list[int]] = defaultdict(list)
+    for position, job in enumerate(jobs):
+        if job.expect is not None and job.expect.group is not None:
+            folder = job.paths[0].parent if job.expect.group.by == "folder" else None
+            groups[job.origin.file, job.expect.group.model_dump_json(), str(folder)].append(position)
+    results: dict[int, tuple[ExpectationResult, ...]] = {}
+    for positions in groups.values():
+        contract = Contract.of(jobs[positions[0]])
+        if contract is not None:
+            members = [_member(jobs[position]) for position in positions]
+            results.update(dict.fromkeys(positions, group_results(contract, members)))
+    return results
+
+
+def _member(job: Job) -> Member:
+    """Return the files and the time span of a recording; the times are None if it cannot be opened."""
+    names = tuple(dict.fromkeys(path.name for path in job.paths))
+    try:
+        with open_job(job) as (recording, _):
+            start_ns, end_ns = time_bounds(recording)
+            is_empty = recording.start_ns is None and start_ns == end_ns == 0
+    except IngestError:  # the run of the recording reports the error
+        return Member(names)
+    return Member(names) if is_empty else Member(names, start_ns, end_ns)

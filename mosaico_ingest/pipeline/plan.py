@@ -23,8 +23,7 @@ from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSe
 from mosaico_ingest.job.split import SequencePart
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.types import OntologyType
-from mosaico_ingest.pipeline.memory import MemoryBudget
-from mosaico_ingest.pipeline.task import Attempt
+from mosaico_ingest.pipeline.task import Attempt, MemoryBudget
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.attachments import Attachment

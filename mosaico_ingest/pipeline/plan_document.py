@@ -20,6 +20,12 @@ from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.units import count_text
 
 Json: TypeAlias = Any
+_NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic"), "files": ("file", "path")}
+"""For each list of a plan, the name of its items and the key that identifies an item."""
+PlanJson: TypeAlias = Mapping[str, Any]
+"""A serialized plan, see `Plan.document`."""
+_Change: TypeAlias = "tuple[str, str | None, str | None]"
+"""Key path, text before, text after."""
 
 
 class Note(Part):
@@ -223,10 +229,6 @@ def notes(findings: Iterable[Finding]) -> tuple[Note, ...]:
     )
 
 
-_NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic"), "files": ("file", "path")}
-"""For each list of a plan, the name of its items and the key that identifies an item."""
-
-
 class Difference(Struct, frozen=True):
     """One difference between two plans; None for a value that one of them does not have."""
 
@@ -243,10 +245,6 @@ class Difference(Struct, frozen=True):
         if self.after is None:
             return f"{self.sequence}: - {self.name}: {self.before}"
         return f"{self.sequence}: {self.name}: {self.before} → {self.after}"
-
-
-PlanJson: TypeAlias = Mapping[str, Any]
-"""A serialized plan, see `Plan.document`."""
 
 
 def differences(before: Sequence[PlanJson], after: Sequence[PlanJson]) -> tuple[Difference, ...]:
@@ -299,10 +297,6 @@ def _one_side(old: PlanJson | None, new: PlanJson | None) -> Difference:
 def _compare(old: PlanJson, new: PlanJson) -> Iterator[Difference]:
     for name, before, after in _compare_mappings("", old, new):
         yield Difference(_sequence(old), name, before, after)
-
-
-_Change: TypeAlias = "tuple[str, str | None, str | None]"
-"""Key path, text before, text after."""
 
 
 def _compare_mappings(name: str, old: Mapping[str, Json], new: Mapping[str, Json]) -> Iterator[_Change]:

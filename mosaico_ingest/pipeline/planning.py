@@ -3,8 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
+from fnmatch import fnmatchcase
+from typing import Any
+
+from msgspec import Struct
 
 from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
 from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
@@ -17,23 +21,27 @@ from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable,
 from mosaico_ingest.job.fields import TopicGlob, image_settings, marked_fields, values_at
 from mosaico_ingest.job.model import Job, JobSettings
 from mosaico_ingest.job.values import (
+    CUSTOM_DATA_KEY,
+    RECORDS_KEY,
     FileNamePattern,
     IfExists,
     LoaderErrorPolicy,
     Selection,
-    StampSource,
-    TimeBound,
     Unmodeled,
     first_match,
-    format_time,
     select,
 )
-from mosaico_ingest.pipeline.attachments import kept_content
-from mosaico_ingest.pipeline.latched import is_static
-from mosaico_ingest.pipeline.memory import MemoryBudget
 from mosaico_ingest.pipeline.plan import ExcludedTopic, Plan, TopicPlan, digest_of, observed_topics
-from mosaico_ingest.pipeline.schema_changes import follow_schema_changes
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.selection import (
+    check_conditions,
+    is_static,
+    latched_before,
+    missing_publish_times,
+    part_range,
+)
+from mosaico_ingest.pipeline.task import MemoryBudget, Task
+from mosaico_ingest.report.units import bytes_text, counted
+from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.blocks import Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
@@ -41,6 +49,18 @@ from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.encodings.table import refusal
 from mosaico_ingest.rosbag.grouping import numbering_gaps
 from mosaico_ingest.rosbag.recording import Recording, no_topics_error
+
+_ROSBAG2_RECORD = "rosbag2"
+"""The metadata record with a copy of `metadata.yaml`, whose content exports write again."""
+
+
+class _KeptContent(Struct, frozen=True):
+    """The metadata and attachments that a plan keeps of a recording."""
+
+    metadata: Mapping[str, Any]
+    """Metadata of the sequence, under reserved keys."""
+    attachments: tuple[Attachment, ...]
+    findings: tuple[Finding, ...]
 
 
 def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resolver: TypeResolver) -> Plan:
@@ -84,15 +104,15 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
     _check_conditions(job, topics, recording)
     _check_metadata(job, topics)
     contract = _contract(task, job, topics, recording)
-    read_from_ns, read_until_ns = _part_range(
+    read_from_ns, read_until_ns = part_range(
         job, recording, has_log_times=all(topic.has_log_times for topic in topics)
     )
     findings += () if job.part is None else job.part.findings
     findings += _image_settings(job, topics)
-    findings += _missing_publish_times(job, recording, topics)
-    findings += _latched_before(job, topics, recording.start_ns, read_from_ns)
+    findings += missing_publish_times(job, recording, topics)
+    findings += latched_before(job, topics, recording.start_ns, read_from_ns)
     findings += _interrupted_replacement(job)
-    content = kept_content(job, recording)
+    content = _kept_content(job, recording)
     findings += content.findings
     plan = Plan(
         sequence=job.sequence.replace(family=job.family, metadata_from=None, metadata_schema=None),
@@ -118,12 +138,8 @@ def plan_recording(task: Task, recording: Recording, *, bridge: ROSBridge, resol
         attempt=task.attempt,
         contract=contract,
     )
-    if job.lock is not None:
-        from mosaico_ingest.pipeline.definition_lock import check_lock, lock_of  # noqa: PLC0415 - only locked jobs need it
-
-        check_lock(job.lock, lock_of(plan, recording.connections), recording=str(recording.files[0]))
-    if job.on_schema_change is not None:
-        plan = follow_schema_changes(plan, job.on_schema_change)
+    if job.lock is not None or job.on_schema_change is not None:
+        plan = _check_definitions(job, plan, recording)
     _check_digest(plan, task)
     return plan
 
@@ -172,8 +188,6 @@ def _with_metadata(job: Job, recording: Recording) -> tuple[Job, tuple[Finding, 
 def _check_conditions(job: Job, topics: Sequence[TopicPlan], recording: Recording) -> None:
     """Raise ManifestError if an expression of `where` or `on_change` does not fit its topic."""
     if any(topic.has_conditions for topic in topics):
-        from mosaico_ingest.pipeline.conditions import check_conditions  # noqa: PLC0415 - only conditions need it
-
         check_conditions(job, topics, recording.connections)
 
 
@@ -185,6 +199,19 @@ def _contract(task: Task, job: Job, topics: Sequence[TopicPlan], recording: Reco
 
         check_expressions(contract, recording.connections, observed_topics(topics))
     return contract
+
+
+def _check_definitions(job: Job, plan: Plan, recording: Recording) -> Plan:
+    """Check the definitions with the lock file and with earlier sequences; return the plan, which `on_schema_change` adapts."""
+    from mosaico_ingest.pipeline.definition_changes import (  # noqa: PLC0415 - few jobs need it
+        check_lock,
+        follow_schema_changes,
+        lock_of,
+    )
+
+    if job.lock is not None:
+        check_lock(job.lock, lock_of(plan, recording.connections), recording=str(recording.files[0]))
+    return plan if job.on_schema_change is None else follow_schema_changes(plan, job.on_schema_change)
 
 
 def _check_metadata(job: Job, topics: Iterable[TopicPlan]) -> None:
@@ -467,117 +494,6 @@ def _exclusion_hint(job: Job, excluded: list[ExcludedTopic]) -> str | None:
     return None
 
 
-def _part_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
-    """Return the start and end of the part that the job ingests, or else of `bag.time`; see `time_range`."""
-    if job.part is not None:
-        return job.part.start_ns, job.part.end_ns
-    bounds = time_range(job, recording, has_log_times=has_log_times)
-    if job.split is not None:
-        hint = "correct the times, or remove split to ingest the complete recording"
-        where = job.where("split") or str(recording.files[0])
-        raise NothingMatched("no part of the recording has messages", where=where, hint=hint)
-    return bounds
-
-
-def time_range(job: Job, recording: Recording, *, has_log_times: bool) -> tuple[int | None, int | None]:
-    """Return the start (inclusive) and the end (exclusive) of the time range, ns since the epoch.
-
-    The range must overlap the recording if the times of all rows are log times.
-
-    Raises:
-        BagError: The range has an offset, and the recording has no index.
-    """
-
-    def instant(bound: TimeBound | None) -> int | None:
-        if bound is None or not bound.relative:
-            return bound.ns if bound else None
-        if recording.start_ns is None or recording.end_ns is None:
-            raise BagError(
-                "the recording has no index, so its start and end are unknown",
-                where=str(recording.files[0]),
-                hint="write bag.time as instants instead of offsets",
-            )
-        return bound.at(recording.start_ns, recording.end_ns)
-
-    start_ns, end_ns = instant(job.bag.time.start), instant(job.bag.time.end)
-    if has_log_times:
-        _check_time_range(job, recording, start_ns, end_ns)
-    return start_ns, end_ns
-
-
-def _check_time_range(job: Job, recording: Recording, start_ns: int | None, end_ns: int | None) -> None:
-    """Raise NothingMatched if a time range is outside the recording or empty."""
-    first_ns, last_ns = recording.start_ns, recording.end_ns
-    if first_ns is None or last_ns is None:
-        return
-    start = first_ns if start_ns is None else max(start_ns, first_ns)
-    end = last_ns + 1 if end_ns is None else min(end_ns, last_ns + 1)
-    if start < end:
-        return
-    first, last = format_time(TimeBound(first_ns)), format_time(TimeBound(last_ns))
-    message = f"the time range selects nothing of the recording, which lasts from {first} to {last}"
-    hint = "change bag.time, or remove it to read the complete recording"
-    span = job.span("bag", "time")
-    raise NothingMatched(
-        message,
-        where=job.where("bag", "time") or str(recording.files[0]),
-        hint=hint,
-        findings=()
-        if span is None
-        else (Finding("time-range-outside", Severity.ERROR, message, span, hint),),
-    )
-
-
-def _missing_publish_times(job: Job, recording: Recording, topics: Iterable[TopicPlan]) -> Iterator[Finding]:
-    """Yield a finding for each pattern with `stamp: publish` if the container has no publish times."""
-    if recording.container == "mcap":
-        return
-    stamps = {
-        glob: settings.stamp
-        for glob, settings in job.topic_settings.items()
-        if "stamp" in settings.model_fields_set
-    }
-    globs = dict.fromkeys(
-        glob
-        for topic in topics
-        if (glob := first_match(stamps, topic.topic)) and topic.stamp is StampSource.PUBLISH
-    )
-    for glob in globs:
-        yield Finding(
-            "no-publish-times",
-            Severity.WARNING,
-            f"stamp: publish has no effect, because {recording.container} recordings contain log times only",
-            job.span("topic_settings", glob, "stamp"),
-            "set stamp to log or header",
-        )
-
-
-def _latched_before(
-    job: Job, topics: list[TopicPlan], start_ns: int | None, read_from_ns: int | None
-) -> Iterator[Finding]:
-    """Yield a finding for each latched topic whose messages before the time range are included or not."""
-    if start_ns is None or read_from_ns is None or read_from_ns <= start_ns:
-        return
-    for topic in topics:
-        if topic.latched:
-            included = "all of them" if is_static(topic.topic) else "the latest one"
-            yield Finding(
-                "latched-topic",
-                Severity.INFO,
-                f"messages of {topic.topic} before the time range are included: {included}",
-                job.span("bag", "time", "start"),
-            )
-        elif is_static(topic.topic):
-            yield Finding(
-                "static-topic",
-                Severity.WARNING,
-                f"the messages of {topic.topic} before the time range are not read; most recordings have them"
-                " at the start",
-                job.span("bag", "time", "include_latched"),
-                "remove bag.time.include_latched if the sequence needs these transforms",
-            )
-
-
 def _check_digest(plan: Plan, task: Task) -> None:
     """Raise IngestError if a task is for another plan."""
     if task.plan_digest is None or digest_of(plan.document(folder=task.job.folder)) == task.plan_digest:
@@ -587,3 +503,46 @@ def _check_digest(plan: Plan, task: Task) -> None:
         where=str(plan.files[0]),
         hint="list the differences with `ingest plan --check`, then create a new plan",
     )
+
+
+def _kept_content(job: Job, recording: Recording) -> _KeptContent:
+    """Select the metadata and attachments that the sequence keeps, according to `sequence.keep`.
+
+    Raises:
+        BagError: The file cannot be read.
+    """
+    keep = job.sequence.keep
+    metadata: dict[str, Any] = {}
+    records = {
+        name: entries
+        for name, entries in (recording.metadata_records() if keep.records else {}).items()
+        if name != _ROSBAG2_RECORD and any(fnmatchcase(name, glob) for glob in keep.records)
+    }
+    if records:
+        metadata[RECORDS_KEY] = [
+            {"name": name, "entries": [list(entry) for entry in entries.items()]}
+            for name, entries in records.items()
+        ]
+    custom_data = recording.custom_data() if keep.custom_data else {}
+    if custom_data:
+        metadata[CUSTOM_DATA_KEY] = [list(entry) for entry in custom_data.items()]
+    attachments = tuple(
+        attachment
+        for attachment in (recording.attachments() if keep.attachments else ())
+        if any(fnmatchcase(attachment.name, glob) for glob in keep.attachments)
+    )
+    return _KeptContent(metadata, attachments, tuple(_attachment_findings(job, attachments)))
+
+
+def _attachment_findings(job: Job, attachments: tuple[Attachment, ...]) -> Iterator[Finding]:
+    """Yield a finding if the destination cannot store the attachments."""
+    destination = destination_of(job.destination)
+    if attachments and not destination.can_attach:
+        size = bytes_text(sum(attachment.size_bytes for attachment in attachments))
+        yield Finding(
+            "attachments-not-stored",
+            Severity.WARNING,
+            f"{counted(len(attachments), 'attachment')} ({size}) cannot be stored in {destination.describe()}",
+            job.span("sequence", "keep", "attachments") or job.span("target"),
+            "ingest into a store as well, or set sequence.keep.attachments: []",
+        )

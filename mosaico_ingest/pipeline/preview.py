@@ -26,10 +26,8 @@ from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists, LoaderErrorPolicy, TopicLevelErrorPolicy, first_match
-from mosaico_ingest.pipeline.contract import attach_monitor, monitor_of
-from mosaico_ingest.pipeline.contract_group import results_by_job
-from mosaico_ingest.pipeline.contract_messages import index_results, sample_results
-from mosaico_ingest.pipeline.opening import open_job
+from mosaico_ingest.pipeline.contract import attach_monitor, index_results, monitor_of, sample_results
+from mosaico_ingest.pipeline.contract_check import results_by_job
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan, digest_of
 from mosaico_ingest.pipeline.plan_document import (
     DestinationState,
@@ -42,7 +40,7 @@ from mosaico_ingest.pipeline.plan_document import (
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.provenance import StoredProvenance, is_repeatable, read_provenance
 from mosaico_ingest.pipeline.run import preflight
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines_by_connection
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
@@ -52,6 +50,13 @@ from mosaico_ingest.report.events import Event, Rejected
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.version import __version__
+
+MESSAGES = 16
+"""Number of messages per topic in the sample."""
+_MEMORY_BYTES = 32 << 20
+_SAMPLE_BYTES, _REMOTE_SAMPLE_BYTES = 64 << 20, 4 << 20
+"""Bytes read to find the messages of the sample; topics that are still missing are then read by the index."""
+_SAMPLE_S = 5.0
 
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
@@ -122,14 +127,6 @@ def _share(plan: Plan) -> float:
     start = max(plan.start_ns, plan.read_from_ns if plan.read_from_ns is not None else plan.start_ns)
     end = min(plan.end_ns, plan.read_until_ns if plan.read_until_ns is not None else plan.end_ns)
     return max(0.0, (end - start) / (plan.end_ns - plan.start_ns))
-
-
-MESSAGES = 16
-"""Number of messages per topic in the sample."""
-_MEMORY_BYTES = 32 << 20
-_SAMPLE_BYTES, _REMOTE_SAMPLE_BYTES = 64 << 20, 4 << 20
-"""Bytes read to find the messages of the sample; topics that are still missing are then read by the index."""
-_SAMPLE_S = 5.0
 
 
 def try_messages(

@@ -9,17 +9,23 @@ from typing import TYPE_CHECKING, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import AmendableSink, Session, Sink, StoredTopic, destination_of
-from mosaico_ingest.errors import IngestError, Interrupted, NothingMatched, VerificationError
+from mosaico_ingest.destinations.base import (
+    AmendableSink,
+    AttachableSession,
+    Attached,
+    Session,
+    Sink,
+    StoredTopic,
+    destination_of,
+)
+from mosaico_ingest.errors import BagError, IngestError, Interrupted, NothingMatched, VerificationError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.values import IfExists, OnFailure, SessionLevelErrorPolicy
-from mosaico_ingest.pipeline.attachments import attach_files
-from mosaico_ingest.pipeline.latched import latched_blocks
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.provenance import SequenceRequest
-from mosaico_ingest.pipeline.quarantine import Quarantine
-from mosaico_ingest.pipeline.selection import row_selector
+from mosaico_ingest.pipeline.rejections import Quarantine
+from mosaico_ingest.pipeline.selection import latched_blocks, row_selector
 from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines_by_connection
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import (
@@ -34,7 +40,7 @@ from mosaico_ingest.report.events import (
 )
 from mosaico_ingest.report.timing import Step, Stopwatch
 from mosaico_ingest.rosbag.blocks import UnreadableRange
-from mosaico_ingest.rosbag.recording import Recording, damage_error
+from mosaico_ingest.rosbag.recording import DAMAGE_HELP, Recording, damage_error
 
 if TYPE_CHECKING:
     from mosaico_ingest.pipeline.contract import ContractRun
@@ -89,7 +95,7 @@ def write_sequence(
             contract = _start_contract(plan, recording, topics)
             reported = frozenset(recording.unreadable)
             try:
-                attach_files(plan, recording, session, observe)
+                _attach_files(plan, recording, session, observe)
                 _pump(plan, recording, topics, buffer, stopwatch, contract=contract)
                 _report_reading(recording, topics, observe, reported=reported)
                 missing = check_counts(plan, recording, topics, observe)
@@ -345,6 +351,24 @@ def _undeclared(topic: TopicPipeline) -> Finding:
         " they are not stored",
         help="add them to the JSON Schema of the channel",
     )
+
+
+def _attach_files(plan: Plan, recording: Recording, session: Session, observe: Observer) -> None:
+    """Store the attachments of a plan. A damaged attachment is not stored, but reported as a finding.
+
+    Raises:
+        SinkError: An attachment cannot be written.
+    """
+    if not plan.attachments or not destination_of(plan.destination).can_attach:
+        return
+    attachable = cast("AttachableSession", session)  # as `can_attach` promises
+    for attachment in plan.attachments:
+        file = Attached(attachment.name, attachment.media_type, attachment.log_ns, attachment.create_ns)
+        try:
+            attachable.attach(file, recording.attachment_chunks(attachment))
+        except BagError as error:
+            message = f"the attachment {attachment.name!r} is not stored: {error.what}"
+            observe(Noted(Finding("damaged-record", Severity.WARNING, message, help=DAMAGE_HELP)))
 
 
 def _open_empty_topics(

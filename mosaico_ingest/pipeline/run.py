@@ -17,14 +17,12 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.interrupts import DeferredInterrupt
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import LoaderErrorPolicy
-from mosaico_ingest.pipeline.fingerprint import fingerprint, is_fingerprinted
-from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import Plan
 from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.provenance import check_provenance
+from mosaico_ingest.pipeline.provenance import check_provenance, fingerprint, is_fingerprinted
 from mosaico_ingest.pipeline.pump import Written, verify, write_sequence
-from mosaico_ingest.pipeline.rejection_log import RejectionLog
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.rejections import RejectionLog
+from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (

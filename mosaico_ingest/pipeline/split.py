@@ -21,9 +21,9 @@ from mosaico_ingest.job.manifest import refusal
 from mosaico_ingest.job.model import Job, TopicSettings
 from mosaico_ingest.job.split import Event, SequencePart, clean_name, interval_finding, overlaps, read_events
 from mosaico_ingest.job.values import StampSource, select
-from mosaico_ingest.pipeline.opening import open_job
-from mosaico_ingest.pipeline.planning import time_range
-from mosaico_ingest.pipeline.selection import Int64s, Mask, block_times
+from mosaico_ingest.pipeline.selection import Mask, block_times, time_range
+from mosaico_ingest.pipeline.task import open_job
+from mosaico_ingest.rosbag.blocks import Int64s
 from mosaico_ingest.rosbag.recording import Recording
 
 MAX_PARTS = 1000

@@ -22,17 +22,16 @@ from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.lazy import cache_by_identity
 from mosaico_ingest.ontology.types import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
-from mosaico_ingest.pipeline.quarantine import Quarantine
-from mosaico_ingest.pipeline.selection import Int64s, RowSelector, block_times, row_times
+from mosaico_ingest.pipeline.rejections import Quarantine
+from mosaico_ingest.pipeline.selection import Conditions, RowSelector, bind_conditions, block_times, row_times
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
 from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
-from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
+from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 
 if TYPE_CHECKING:
     from mosaico_ingest.contracts.monitor import BlockObserver
-    from mosaico_ingest.pipeline.conditions import Conditions
 
 LATCHED_KEY = "_latched_"
 """Key of topic metadata: `before_ns` is the time before which rows are messages from before the time range."""
@@ -140,8 +139,6 @@ class TopicPipeline:
         if self.plan.shares_messages:
             return
         if self.plan.has_conditions:
-            from mosaico_ingest.pipeline.conditions import bind_conditions  # noqa: PLC0415 - only conditions need it
-
             self._conditions[connection.id] = bind_conditions(self.plan, connection.definition)
         self._decoders[connection.id] = decoder_for(connection)
 

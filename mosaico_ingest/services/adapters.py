@@ -31,9 +31,8 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.manifest import load_manifest
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.compile import compile_manifest
-from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.run import make_plan
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import (

@@ -15,8 +15,7 @@ from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Origin
-from mosaico_ingest.pipeline.contract_check import check_contract
-from mosaico_ingest.pipeline.contract_group import results_by_job
+from mosaico_ingest.pipeline.contract_check import check_contract, results_by_job
 from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 
 

@@ -26,9 +26,8 @@ from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.reference import plain
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.contract import monitor_of
-from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.contract import ContractResult, Outcome
 from mosaico_ingest.report.timing import mean_rate_hz

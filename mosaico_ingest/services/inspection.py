@@ -17,9 +17,9 @@ from mosaico_ingest.findings import one_line
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.reference import plain
 from mosaico_ingest.job.values import Stores, select
-from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import plan_connection
+from mosaico_ingest.pipeline.task import open_job
 from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text, seconds_text

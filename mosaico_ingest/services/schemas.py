@@ -26,7 +26,7 @@ from mosaico_ingest.job.reference import job_schema
 from mosaico_ingest.ontology.registry import MODULES, model, ontology_type, tags
 from mosaico_ingest.ontology.units import column_unit
 from mosaico_ingest.pipeline.compile import lock_path, read_lock_file
-from mosaico_ingest.pipeline.definition_lock import (
+from mosaico_ingest.pipeline.definition_changes import (
     LockDifference,
     LockDocument,
     check_lock,
@@ -35,9 +35,8 @@ from mosaico_ingest.pipeline.definition_lock import (
     merge_locks,
     read_lock,
 )
-from mosaico_ingest.pipeline.opening import open_job
 from mosaico_ingest.pipeline.planning import plan_recording
-from mosaico_ingest.pipeline.task import Task
+from mosaico_ingest.pipeline.task import Task, open_job
 
 
 class WrittenLock(Struct, frozen=True):

@@ -16,15 +16,15 @@ from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched, Se
 from mosaico_ingest.findings import escape_undecodable, join_names
 from mosaico_ingest.job.model import ErrorPolicy, Job, QuarantineSettings, TimeRange, TopicSettings
 from mosaico_ingest.job.values import IfExists, SessionLevelErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.pipeline.known import with_known
 from mosaico_ingest.pipeline.provenance import (
     add_doubtful_digests,
     content_digest,
     decide_skip,
     read_provenance,
     stored_provenance,
+    with_known,
 )
-from mosaico_ingest.pipeline.quarantine import QuarantineFile, find_quarantine_files
+from mosaico_ingest.pipeline.rejections import QuarantineFile, find_quarantine_files
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
 

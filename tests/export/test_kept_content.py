@@ -21,9 +21,8 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.store import verify_attachments
 from mosaico_ingest.export import export_sequence
-from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, CUSTOM_DATA_KEY, RECORDS_KEY, IfExists
 from mosaico_ingest.pages.sequence import sequence_page
-from mosaico_ingest.pipeline.attachments import CUSTOM_DATA_KEY, RECORDS_KEY
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
 

@@ -18,7 +18,7 @@ from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.lint.engine import lint_paths
-from mosaico_ingest.pipeline.definition_lock import (
+from mosaico_ingest.pipeline.definition_changes import (
     Change,
     LockDocument,
     LockedTopic,

@@ -20,7 +20,7 @@ from mosaico_ingest import RosbagInjector, ROSInjectionConfig
 from mosaico_ingest.destinations.store import Store, session
 from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import IngestError, SinkError
-from mosaico_ingest.pipeline.memory import MemoryBudget
+from mosaico_ingest.pipeline.task import MemoryBudget
 from mosaico_ingest.report.events import Event, Observer, TopicProgress, ignore_events
 from mosaico_ingest.report.model import Report
 from mosaico_ingest.rosbag import blocks, recording

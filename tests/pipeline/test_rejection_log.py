@@ -11,7 +11,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from mosaico_ingest import LoaderErrorPolicy, RosbagInjector, ROSInjectionConfig
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.findings import Stage
-from mosaico_ingest.pipeline.rejection_log import RejectionLog
+from mosaico_ingest.pipeline.rejections import RejectionLog
 from mosaico_ingest.report.events import Rejected, RunFinished, RunStatus
 
 GOOD = b"\x00\x01\x00\x00" + bytes(8)

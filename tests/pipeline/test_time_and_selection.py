@@ -25,10 +25,9 @@ from mosaico_ingest.contracts.rows import Rows, bind_expression
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.lint.engine import lint_paths
-from mosaico_ingest.pipeline.conditions import ConditionFilter, Conditions, bind_conditions
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.run import Outcome, make_plan, run_recording
-from mosaico_ingest.pipeline.selection import RowSelector
+from mosaico_ingest.pipeline.selection import ConditionFilter, Conditions, RowSelector, bind_conditions
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import LATCHED_KEY
 from mosaico_ingest.rosbag.blocks import Encoding

@@ -17,8 +17,9 @@ from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.pipeline import fingerprint, opening
-from mosaico_ingest.pipeline.known import known_recordings
+from mosaico_ingest.pipeline import provenance as fingerprint
+from mosaico_ingest.pipeline import task as opening
+from mosaico_ingest.pipeline.provenance import known_recordings
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.services.status import Status
 

@@ -14,7 +14,7 @@ import yaml
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.pipeline.quarantine import QuarantineFile
+from mosaico_ingest.pipeline.rejections import QuarantineFile
 from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.services.status import ReplayState, find_replays, lock_quarantine
 
@@ -28,9 +28,9 @@ MOMENTS = {
     "segments moved, not entered": ("mosaico_ingest.destinations.store.files.LocalFiles", "publish", "after"),
     "committed": (f"{_STORE}.StoreDestination", "commit", "after"),
     "committed and checked": ("mosaico_ingest.destinations.store.session.StoreSession", "stored", "after"),
-    "before it is marked": ("mosaico_ingest.pipeline.quarantine.QuarantineFile", "mark_replayed", "before"),
+    "before it is marked": ("mosaico_ingest.pipeline.rejections.QuarantineFile", "mark_replayed", "before"),
     "messages renamed, their index not": ("pathlib.Path", "rename", "after"),
-    "marked": ("mosaico_ingest.pipeline.quarantine.QuarantineFile", "mark_replayed", "after"),
+    "marked": ("mosaico_ingest.pipeline.rejections.QuarantineFile", "mark_replayed", "after"),
 }
 _KILLED = """
 import importlib, os, signal, sys

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.lint.check import Check, Job, Problem
 from mosaico_ingest.pipeline.compile import read_lock_file
-from mosaico_ingest.pipeline.definition_lock import read_lock
+from mosaico_ingest.pipeline.definition_changes import read_lock
 
 
 def check(job: Job) -> Iterator[Problem]:
