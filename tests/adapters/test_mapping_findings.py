@@ -107,6 +107,7 @@ def findings_of(text: str) -> list[tuple[Finding, str]]:
         ("flag: status", "type-mismatch", "status"),
         ("flag: serial == null", "operand-type", "null"),
         ("flag: serial < 3", "operand-type", "serial < 3"),
+        ("raw: null_if(nine, nine)", "operand-type", "nine"),
         ("flag: starts_with(serial, serial)", "operand-type", "serial"),
         ("name: replace(serial, '', 'a')", "operand-type", "''"),
         ("name: extract(serial, '(')", "operand-type", "'('"),

@@ -22,6 +22,7 @@ from mosaico_ingest.adapters.mapping.functions.operators import (
     float_result,
     integer_result,
     numbers,
+    refuse_nested,
     shifted,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import (
@@ -52,6 +53,7 @@ def _element_type(expr_type: ExprType, *_: ExprType) -> ExprType:
 
 def _null_if(expr_type: ExprType, value: ExprType) -> ExprType:
     common_type([expr_type, value])
+    refuse_nested(expr_type)
     return expr_type.element
 
 

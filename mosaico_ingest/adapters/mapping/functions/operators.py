@@ -80,11 +80,15 @@ def _ordered(left: ExprType, right: ExprType) -> ExprType:
             )
     if not (is_number(left.arrow) and is_number(right.arrow)) and left.arrow != right.arrow:
         raise TypeMismatch(f"{format_type(left)} cannot be compared with {format_type(right)}")
-    if pt.is_nested(left.arrow):
-        raise TypeMismatch(
-            f"{format_type(left)} cannot be compared", argument=0, hint="compare its fields or elements"
-        )
+    refuse_nested(left)
     return ExprType(arrays.bool_())
+
+
+def refuse_nested(operand: ExprType) -> None:
+    """Raise `TypeMismatch` for a list or message as the first of two compared operands."""
+    if pt.is_nested(operand.arrow):
+        message = f"{format_type(operand)} cannot be compared"
+        raise TypeMismatch(message, argument=0, hint="compare its fields or elements")
 
 
 def _to_int64(refuse: RejectRows, values: Array, nulls: Mask | None) -> Array:
