@@ -20,6 +20,9 @@ from mosaico_ingest.remote import AnyPath, RemotePath, translate_errors
 from mosaico_ingest.rosbag.compression import allocate
 
 _WINDOW_BYTES = 1 << 16
+_SEARCH_BYTES = 1 << 20
+_SEARCH_OVERLAP_BYTES = 1 << 10
+"""Overlap of two steps of a search; more than any pattern spans."""
 
 
 class Source(Protocol):
@@ -219,6 +222,28 @@ class Window:
             self._data = self._source.read_some(offset, min(max(size, _WINDOW_BYTES), available))
             self._offset, start = offset, 0
         return self._data[start : start + size]
+
+
+def find_record(
+    source: Source,
+    start: int,
+    stop: int,
+    candidates: Callable[[bytes], Iterator[int]],
+    is_record: Callable[[int], bool],
+) -> int | None:
+    """Return the offset of the next record between `start` and `stop` after bytes that are not valid records.
+
+    `candidates` yields the positions within some bytes where a record may start, and `is_record` checks a file offset.
+    """
+    while start < stop:
+        data = source.read_some(start, min(_SEARCH_BYTES, stop - start))
+        for candidate in candidates(data):
+            if is_record(start + candidate):
+                return start + candidate
+        if len(data) < _SEARCH_BYTES:
+            return None
+        start += _SEARCH_BYTES - _SEARCH_OVERLAP_BYTES
+    return None
 
 
 class Fields:

@@ -25,11 +25,11 @@ from mosaico_ingest.rosbag.mcap.records import (
     SchemaRecord,
     channel_of,
     chunk_head,
+    find_chunk,
     metadata_of,
     records_in,
     schema_of,
 )
-from mosaico_ingest.rosbag.recovery import find_mcap_chunk
 from mosaico_ingest.rosbag.source import Fields, Source, Window
 
 T = TypeVar("T")
@@ -306,7 +306,7 @@ class _Walk:
             if op in (Op.DATA_END, Op.FOOTER) and end <= stop:
                 break
             if op == 0 or end > stop:
-                next_chunk = find_mcap_chunk(self._source, position + 1, stop)
+                next_chunk = find_chunk(self._source, position + 1, stop)
                 resume_at = stop if next_chunk is None else next_chunk
                 self._distrust_last_chunk(position)
                 self._add_invalid(op, position, end, resume_at)

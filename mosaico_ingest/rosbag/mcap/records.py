@@ -5,13 +5,16 @@ from __future__ import annotations
 import struct
 from collections.abc import Iterator, Mapping
 
+import numpy as np
 from msgspec import Struct
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.source import Fields
+from mosaico_ingest.rosbag.source import Fields, Source, find_record
 
 RECORD = struct.Struct("<BQ")
 """The head of every record: its kind, and the number of bytes that follow."""
+_HEAD_BYTES = 256
+"""Bytes to read for the head of a chunk record; more than it can take."""
 
 
 class Op:
@@ -109,6 +112,22 @@ def records_in(data: bytes | memoryview) -> Iterator[tuple[int, int, int]]:
         position += length
 
 
+def find_chunk(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete chunk between `start` and `stop`, None if there is none."""
+
+    def is_chunk(offset: int) -> bool:
+        data = source.read_some(offset, _HEAD_BYTES)
+        try:
+            head = chunk_head(data)
+        except BagError:
+            return False
+        _, length = RECORD.unpack_from(data)
+        end = RECORD.size + length
+        return head.end == end and offset + end <= stop and head.compression in {"", "zstd", "lz4"}
+
+    return find_record(source, start, stop, _chunk_candidates, is_chunk)
+
+
 def record_bytes(op: int, content: bytes | bytearray) -> bytes:
     """Return a serialized record."""
     return RECORD.pack(op, len(content)) + content
@@ -124,3 +143,12 @@ def texts_bytes(texts: Mapping[str, str]) -> bytes:
     """Return a serialized map of strings: its length in bytes, then keys and values."""
     data = b"".join(text_bytes(part) for item in texts.items() for part in item)
     return struct.pack("<I", len(data)) + data
+
+
+def _chunk_candidates(data: bytes) -> Iterator[int]:
+    """Yield positions with the kind of a chunk, a length below 2**40 and a short name of the compression."""
+    view = np.frombuffer(data, np.uint8)
+    count = max(len(view) - 41, 0)
+    zeros = [view[position : position + count] == 0 for position in (6, 7, 8, 38, 39, 40)]
+    likely = np.logical_and.reduce([view[:count] == Op.CHUNK, view[37 : 37 + count] <= len("zstd"), *zeros])
+    yield from np.flatnonzero(likely).tolist()

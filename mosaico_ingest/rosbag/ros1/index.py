@@ -12,13 +12,13 @@ from msgspec.structs import replace
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import UnreadableRange
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES, decompress_partially
-from mosaico_ingest.rosbag.recovery import find_ros1_chunk
 from mosaico_ingest.rosbag.ros1.records import (
     ConnectionRecord,
     Op,
     Record,
     chunk_head,
     connection_of,
+    find_chunk,
     index_entries,
     messages_in,
     number,
@@ -151,7 +151,7 @@ class _Walk:
             try:
                 record = record_at(self._window, position, stop)
             except BagError as err:
-                next_chunk = find_ros1_chunk(self._source, position + 1, stop)
+                next_chunk = find_chunk(self._source, position + 1, stop)
                 resume_at = stop if next_chunk is None else next_chunk
                 self._recount_last_chunk(position)
                 self._add_invalid(position, resume_at, err.what)

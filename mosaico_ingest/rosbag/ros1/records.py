@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Mapping
+import struct
+from collections.abc import Callable, Iterator, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -11,6 +12,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
+from mosaico_ingest.rosbag.source import Source, Window, find_record
 
 _MAX_HEADER_BYTES = 1 << 20
 INDEX_ENTRY = np.dtype([("sec", "<u4"), ("nsec", "<u4"), ("offset", "<u4")])
@@ -71,6 +73,19 @@ class Peekable(Protocol):
     def peek(self, offset: int, size: int) -> bytes:
         """Return up to `size` bytes; fewer at the end."""
         ...
+
+
+class _Kind(Struct, frozen=True):
+    """The features by which a kind of ROS 1 record is recognized."""
+
+    op: int
+    fields: frozenset[bytes]
+    max_before: int
+    """Maximum distance from the start of the header to its field `op=`, in bytes."""
+
+
+_CHUNK = _Kind(Op.CHUNK, frozenset({b"compression", b"size"}), 128)
+_MESSAGE = _Kind(Op.MESSAGE, frozenset({b"topic", b"type", b"md5", b"sec", b"nsec"}), 512)
 
 
 def number(header: Header, name: bytes, size: int) -> int:
@@ -221,3 +236,43 @@ def chunk_head(raw: bytes | memoryview) -> ChunkHead:
     compression = header.get(b"compression", b"none").decode("ascii", "replace")
     end = start + int.from_bytes(raw[start - 4 : start], "little")
     return ChunkHead(compression, number(header, b"size", 4), start, end)
+
+
+def find_chunk(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete chunk of a ROS 1 bag, None if there is none."""
+    return find_record(source, start, stop, _candidates(_CHUNK), _is_kind(source, stop, _CHUNK))
+
+
+def find_message(source: Source, start: int, stop: int) -> int | None:
+    """Return the offset of the next complete message of a bag of version 1.2, None if there is none."""
+    return find_record(source, start, stop, _candidates(_MESSAGE), _is_kind(source, stop, _MESSAGE))
+
+
+def _is_kind(source: Source, stop: int, kind: _Kind) -> Callable[[int], bool]:
+    """Return a predicate: whether a complete record of the kind starts at an offset."""
+    window = Window(source)
+
+    def is_record(offset: int) -> bool:
+        try:
+            record = record_at(window, offset, stop)
+        except BagError:
+            return False
+        return record.op == kind.op and kind.fields <= record.header.keys()
+
+    return is_record
+
+
+def _candidates(kind: _Kind) -> Callable[[bytes], Iterator[int]]:
+    """Return a function that yields the positions of record headers that contain the field `op=` of the kind."""
+    field = re.compile(re.escape(b"\x04\x00\x00\x00op=" + bytes([kind.op])))
+
+    def candidates(data: bytes) -> Iterator[int]:
+        next_start = 0
+        for match in field.finditer(data):
+            for start in range(max(match.start() - kind.max_before, next_start), match.start() - 3):
+                (size,) = struct.unpack_from("<I", data, start)
+                if match.end() - start - 4 <= size <= 2 * kind.max_before:
+                    yield start
+            next_start = max(match.start() - 3, next_start)
+
+    return candidates

@@ -28,8 +28,7 @@ from mosaico_ingest.rosbag.blocks import (
     rows_by_connection,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.recovery import find_ros1_message
-from mosaico_ingest.rosbag.ros1.records import Header, Record, number, record_at
+from mosaico_ingest.rosbag.ros1.records import Header, Record, find_message, number, record_at
 from mosaico_ingest.rosbag.source import Source, Window
 
 _DEFINITION, _MESSAGE, _FILE = 1, 2, 3
@@ -166,7 +165,7 @@ class _Walk:
             record = record_at(window, position, stop)
             self._add_record(record)
         except BagError as err:
-            resume_at = find_ros1_message(self._source, position + 1, stop) or stop
+            resume_at = find_message(self._source, position + 1, stop) or stop
             reason = f"{err.what}; {resume_at - position} bytes are not read"
             self.unreadable.append(UnreadableRange(position, reason))
             return resume_at
