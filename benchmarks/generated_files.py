@@ -35,7 +35,7 @@ registry.builtin_type = lambda tag: registry.model(tag).ontology_type()
 from functools import cache
 from rosbags.typesys import Stores, get_typestore
 from mosaico_ingest.rosbag.definitions import distros
-from mosaico_ingest.rosbag.definitions.idl import message_type
+from mosaico_ingest.rosbag.definitions.rosbags_types import message_type
 types_of = cache(lambda distro: get_typestore(Stores(distro)).fielddefs)
 def distro_type(distro, name):
     types = types_of(distro.value)

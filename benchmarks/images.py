@@ -16,14 +16,14 @@ from pathlib import Path
 import numpy as np
 from measure import run, typical
 
-from mosaico_ingest.images.encode import encode_image
-from mosaico_ingest.images.encodings import RawImage
+from mosaico_ingest.images import RawImage
+from mosaico_ingest.images.files import encode_image
 from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 from mosaico_ingest.rosbag.serialization import Serializer
-from mosaico_ingest.rosbag.writers import open_writer
 
 WIDTH, HEIGHT, RATE = 1280, 720, 10
 ROUNDS = 3

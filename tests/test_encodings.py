@@ -20,7 +20,7 @@ from mosaico_ingest.errors import IngestError, NothingMatched
 from mosaico_ingest.export import export_sequence
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.encodings.json_schema import read_schema
-from mosaico_ingest.rosbag.mcap.records import text_bytes
+from mosaico_ingest.rosbag.mcap.index import text_bytes
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
 
 START_NS = 1_700_000_000_000_000_000

@@ -13,7 +13,7 @@ import pytest
 from typer.main import get_command
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.images.encodings import ENCODINGS
+from mosaico_ingest.images import ENCODINGS
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "viewing.md").read_text(encoding="utf-8")

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, encoding_of
 
 ROS_METADATA_KEY = "_ros_"
 """Reserved key: it takes precedence over the same key in the user's topic metadata."""

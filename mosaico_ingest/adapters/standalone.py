@@ -24,7 +24,7 @@ from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
-from mosaico_ingest.rosbag.typestore import definition_in, native_message
+from mosaico_ingest.rosbag.definitions.rosbags_types import definition_in, native_message
 
 
 class DefinitionFinder:

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from mosaico_ingest.destinations.store import TopicInfo
-    from mosaico_ingest.images.encodings import Pixels
+    from mosaico_ingest.images import Pixels
     from mosaico_ingest.view.series import Series
 
 CHART_HEIGHT = 16

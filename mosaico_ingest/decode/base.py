@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.errors import DecodeError
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.rosbag.blocks import Int64s, MessageBlock
-from mosaico_ingest.rosbag.encodings.table import MessageReader
+from mosaico_ingest.rosbag.encodings import MessageReader
 
 
 class Decoded(Struct, frozen=True):

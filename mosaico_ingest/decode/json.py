@@ -22,8 +22,7 @@ from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
-from mosaico_ingest.rosbag.encodings.json_schema import confirming_type
-from mosaico_ingest.rosbag.encodings.json_types import JsonType
+from mosaico_ingest.rosbag.encodings.json_schema import JsonType, confirming_type
 
 _FEW = 4
 """Up to this many messages, row-wise decoding is faster."""

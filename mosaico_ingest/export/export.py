@@ -35,8 +35,8 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.writers import RecordingWriter, check_new_recording, open_writer
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, encoding_of
+from mosaico_ingest.rosbag.rosbags_library import RecordingWriter, check_new_recording, open_writer
 
 _log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ from mosaico_ingest.errors import BagError
 from mosaico_ingest.export.sources import SourceSequence
 from mosaico_ingest.findings import join_names
 from mosaico_ingest.job.values import CUSTOM_DATA_KEY, RECORDS_KEY
-from mosaico_ingest.rosbag.attachments import Attachment
-from mosaico_ingest.rosbag.writers import AttachmentWriter, RecordingWriter
+from mosaico_ingest.rosbag.blocks import Attachment
+from mosaico_ingest.rosbag.rosbags_library import AttachmentWriter, RecordingWriter
 
 _READ_BYTES = 1 << 20
 

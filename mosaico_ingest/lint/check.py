@@ -35,8 +35,8 @@ from mosaico_ingest.job.validation import key_path_of
 from mosaico_ingest.job.values import Stores, TimeBound
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
-from mosaico_ingest.rosbag.definitions.distros import distro_type
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
+from mosaico_ingest.rosbag.definitions.registry import distro_type
 from mosaico_ingest.rules import RULES
 
 _PLACEHOLDER = "missing"

@@ -42,8 +42,7 @@ from mosaico_ingest.metadata.sources import source_spans, with_spans
 from mosaico_ingest.metadata.validation import read_json
 from mosaico_ingest.protocol import is_sequence_name
 from mosaico_ingest.remote import AnyPath, RemotePath, with_network, without_options
-from mosaico_ingest.rosbag.discovery import recording_files
-from mosaico_ingest.rosbag.grouping import SplitGroup, group_splits, has_split_number
+from mosaico_ingest.rosbag.discovery import SplitGroup, group_splits, has_split_number, recording_files
 
 _READ_LATER = {PathRole.WORKER_FILE, PathRole.DEFINITIONS, PathRole.SCHEMA}
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")

@@ -25,8 +25,7 @@ from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.report.units import counted
 from mosaico_ingest.rosbag.blocks import Connection
-from mosaico_ingest.rosbag.definitions.model import Definition
-from mosaico_ingest.rosbag.definitions.parser import spell
+from mosaico_ingest.rosbag.definitions.model import Definition, spell
 
 _HINT = "write a lock file with `ingest schema lock job.yaml`"
 

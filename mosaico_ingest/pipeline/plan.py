@@ -26,7 +26,7 @@ from mosaico_ingest.ontology.types import OntologyType
 from mosaico_ingest.pipeline.task import Attempt, MemoryBudget
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.units import count_text, counted
-from mosaico_ingest.rosbag.attachments import Attachment
+from mosaico_ingest.rosbag.blocks import Attachment
 from mosaico_ingest.rosbag.definitions.model import Resolver
 
 

@@ -41,13 +41,12 @@ from mosaico_ingest.pipeline.selection import (
 )
 from mosaico_ingest.pipeline.task import MemoryBudget, Task
 from mosaico_ingest.report.units import bytes_text, counted
-from mosaico_ingest.rosbag.attachments import Attachment
-from mosaico_ingest.rosbag.blocks import Connection, Encoding
+from mosaico_ingest.rosbag.blocks import Attachment, Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
-from mosaico_ingest.rosbag.encodings.table import refusal
-from mosaico_ingest.rosbag.grouping import numbering_gaps
+from mosaico_ingest.rosbag.discovery import numbering_gaps
+from mosaico_ingest.rosbag.encodings import refusal
 from mosaico_ingest.rosbag.recording import Recording, no_topics_error
 
 _ROSBAG2_RECORD = "rosbag2"

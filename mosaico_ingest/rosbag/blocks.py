@@ -19,7 +19,6 @@ from msgspec.structs import force_setattr
 from numpy.typing import NDArray
 
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
 if TYPE_CHECKING:
@@ -35,10 +34,31 @@ _FEW_ROWS_PER_LENGTH = 8
 """With fewer messages per distinct length on average, `pack` gathers words instead of copying length by length."""
 _MIN_WORD_BYTES, _MAX_WORD_BYTES = 4, 64
 """Range of the word size in which `pack` gathers payloads: it needs one index per word instead of one per byte."""
-
 Bytes = NDArray[np.uint8]
 Int64s = NDArray[np.int64]
 T = TypeVar("T")
+ROSBAG2_RECORD, ROSBAG2_ENTRY = "rosbag2", "serialized_metadata"
+"""The metadata record and its entry in which rosbag2 stores the text of `metadata.yaml`."""
+
+
+class Attachment(Struct, frozen=True):
+    """An attachment of a recording; its content is read by `Recording.attachment_chunks`."""
+
+    name: str
+    media_type: str
+    log_ns: int
+    """The time at which the recorder received it, ns since the epoch."""
+    create_ns: int
+    """The time at which it was created, ns since the epoch; 0 if unknown."""
+    size_bytes: int
+    has_crc: bool = False
+    """Whether the recording has a checksum of the attachment."""
+    split: int = 0
+    """The number of the split that contains it."""
+    offset: int = 0
+    """File offset of the content of its record."""
+    data_offset: int = 0
+    """File offset of its first byte."""
 
 
 class Encoding(str, Enum):
@@ -234,10 +254,6 @@ class SplitReader(Protocol):
         ...
 
 
-ROSBAG2_RECORD, ROSBAG2_ENTRY = "rosbag2", "serialized_metadata"
-"""The metadata record and its entry in which rosbag2 stores the text of `metadata.yaml`."""
-
-
 @runtime_checkable
 class HasMetadataRecords(Protocol):
     """A reader of a container that can contain metadata records."""
@@ -403,33 +419,6 @@ def add_selected_rows(
         add_selected(block.rows(rows, connection=connection), request, result)
 
 
-def _is_in_time_range(block: MessageBlock, request: ReadRequest) -> bool:
-    if not len(block):
-        return True
-    first, last = int(block.log_times.min()), int(block.log_times.max())
-    return max(request.start_ns, 0) <= first and last < request.end_ns
-
-
-def _in_time_range(
-    block: MessageBlock, request: ReadRequest, unreadable: list[UnreadableRange]
-) -> MessageBlock:
-    """Return the messages within the requested range; report log times beyond 2262 as unreadable."""
-    if _is_in_time_range(block, request):
-        return block
-    times = block.log_times
-    overflowed = times < 0  # the file stores unsigned integers
-    if bool(overflowed.any()):
-        offset = int(block.offsets[int(overflowed.argmax())])
-        reason = f"log time {int(times.view(np.uint64).max())} ns is after the year 2262"
-        unreadable.append(
-            UnreadableRange(offset, reason, connection=block.connection, count=int(overflowed.sum()))
-        )
-    selected = ~overflowed & (times >= request.start_ns)
-    if request.end_ns <= LATEST_NS:
-        selected &= times < request.end_ns
-    return block.rows(selected)
-
-
 def sort_by_time(block: MessageBlock) -> MessageBlock:
     """Return the messages sorted by log time; the sort is stable."""
     times = block.log_times
@@ -460,6 +449,33 @@ def pack(block: MessageBlock) -> MessageBlock:
         copies.append(fixed_slices(block.data, block.starts[rows], length).reshape(-1))
         end += len(rows) * length
     return _with_data(block, np.concatenate(copies), starts)
+
+
+def _is_in_time_range(block: MessageBlock, request: ReadRequest) -> bool:
+    if not len(block):
+        return True
+    first, last = int(block.log_times.min()), int(block.log_times.max())
+    return max(request.start_ns, 0) <= first and last < request.end_ns
+
+
+def _in_time_range(
+    block: MessageBlock, request: ReadRequest, unreadable: list[UnreadableRange]
+) -> MessageBlock:
+    """Return the messages within the requested range; report log times beyond 2262 as unreadable."""
+    if _is_in_time_range(block, request):
+        return block
+    times = block.log_times
+    overflowed = times < 0  # the file stores unsigned integers
+    if bool(overflowed.any()):
+        offset = int(block.offsets[int(overflowed.argmax())])
+        reason = f"log time {int(times.view(np.uint64).max())} ns is after the year 2262"
+        unreadable.append(
+            UnreadableRange(offset, reason, connection=block.connection, count=int(overflowed.sum()))
+        )
+    selected = ~overflowed & (times >= request.start_ns)
+    if request.end_ns <= LATEST_NS:
+        selected &= times < request.end_ns
+    return block.rows(selected)
 
 
 def _with_data(block: MessageBlock, data: Bytes, starts: Int64s) -> MessageBlock:

@@ -20,7 +20,7 @@ from mosaico_ingest.job.values import LoaderErrorPolicy, Stores, select
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock, ROSMessage, UnreadableRange
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, TypeResolver
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS
 from mosaico_ingest.rosbag.recording import (
     Recording,
     no_topics_error,
@@ -255,13 +255,13 @@ def distro_and_types(
     """Return a distro, or the texts of the types in a typestore of rosbags."""
     if source is None or isinstance(source, (str, Enum)):
         return source, {}
-    from mosaico_ingest.rosbag.typestore import definition_texts  # noqa: PLC0415 - imports rosbags
+    from mosaico_ingest.rosbag.definitions.rosbags_types import definition_texts  # noqa: PLC0415 - imports rosbags
 
     return Stores.EMPTY, definition_texts(source)
 
 
 def _open_with_rosbags(paths: Sequence[Path | RemotePath], resolver: TypeResolver) -> _Source:
-    from mosaico_ingest.rosbag.rosbags_reader import RosbagsRecording  # noqa: PLC0415 - the native reader does not need it
+    from mosaico_ingest.rosbag.rosbags_library import RosbagsRecording  # noqa: PLC0415 - the native reader does not need it
 
     local = [path for path in paths if isinstance(path, Path)]
     if len(local) < len(paths):

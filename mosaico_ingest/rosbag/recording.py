@@ -21,7 +21,6 @@ from typing_extensions import Self
 from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.remote import AnyPath, RemotePath
-from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.batching import (
     BlockCoalescer,
     MergedTask,
@@ -34,6 +33,7 @@ from mosaico_ingest.rosbag.blocks import (
     LATEST_NS,
     ROSBAG2_ENTRY,
     ROSBAG2_RECORD,
+    Attachment,
     ChunkChecksum,
     Connection,
     Encoding,
@@ -49,7 +49,7 @@ from mosaico_ingest.rosbag.blocks import (
     UnreadableRange,
 )
 from mosaico_ingest.rosbag.compression import CHUNK_LIMIT_KEY, MAX_CHUNK_BYTES, decompress_messages
-from mosaico_ingest.rosbag.definitions.hashes import definition_difference
+from mosaico_ingest.rosbag.definitions.linking import definition_difference
 from mosaico_ingest.rosbag.definitions.model import (
     Definition,
     Embedded,
@@ -62,13 +62,15 @@ from mosaico_ingest.rosbag.discovery import (
     Metadata,
     MetadataTopic,
     RecordingFiles,
+    add_missing_messages,
     discover,
+    listed_counts,
     may_have_custom_data,
+    missing_after_reading,
+    open_split,
     parse_metadata,
 )
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, MessageEncoding, refusal
-from mosaico_ingest.rosbag.listed_counts import add_missing_messages, listed_counts, missing_after_reading
-from mosaico_ingest.rosbag.opening import open_split
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, MessageEncoding, refusal
 
 BlockObserver: TypeAlias = Callable[[int, int, MessageBlock], None]
 """Receives the number of a split, the id of a connection, and messages over the buffer that was read."""
@@ -194,7 +196,7 @@ class Recording:
                 or definition.shape is not None
             ):
                 continue
-            from mosaico_ingest.rosbag.encodings.json_inference import infer_definition  # noqa: PLC0415 - rarely needed
+            from mosaico_ingest.rosbag.encodings.json_messages import infer_definition  # noqa: PLC0415 - rarely needed
 
             inferred = infer_definition(definition, self.message_blocks([connection.id]))
             connections[connection.id] = replace(connection, definition=inferred)

@@ -25,15 +25,15 @@ from typing import Any, Protocol
 
 from mosaico_ingest.errors import BagError, DecodeError
 from mosaico_ingest.rosbag.blocks import Encoding
-from mosaico_ingest.rosbag.definitions.distros import distro_definitions
 from mosaico_ingest.rosbag.definitions.model import (
+    BYTES,
     Container,
     Definition,
     Field,
     MessageType,
     Source,
 )
-from mosaico_ingest.rosbag.definitions.parser import BYTES
+from mosaico_ingest.rosbag.definitions.registry import distro_definitions
 
 FORMATS: Mapping[str, str] = {
     "bool": "B", "byte": "B", "char": "B", "uint8": "B", "int8": "b", "uint16": "H", "int16": "h",

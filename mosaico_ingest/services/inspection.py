@@ -24,8 +24,8 @@ from mosaico_ingest.remote import AnyPath, RemotePath
 from mosaico_ingest.report.timing import mean_rate_hz
 from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text, seconds_text
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, Int64s
-from mosaico_ingest.rosbag.definitions.distros import ROS2, distro_type
 from mosaico_ingest.rosbag.definitions.model import Source
+from mosaico_ingest.rosbag.definitions.registry import ROS2, distro_type
 from mosaico_ingest.rosbag.recording import Recording
 
 _REFUSED = re.compile(r"[^A-Za-z0-9_-]+")

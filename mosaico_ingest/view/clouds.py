@@ -12,8 +12,7 @@ import pyarrow as pa
 from msgspec import Struct
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import color_map
-from mosaico_ingest.images.encodings import Pixels, gray
+from mosaico_ingest.images import Pixels, color_map, gray
 
 _NUMPY_TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")
 """The types of point fields, from code 1 (INT8) to 8 (FLOAT64)."""

@@ -12,14 +12,20 @@ import numpy.typing as npt
 import pyarrow as pa
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import (
+from mosaico_ingest.images import (
+    Pixels,
+    RawImage,
     color_map,
+    demosaic,
     depth_from_inverse,
     depth_parameters,
     depth_payload,
+    eight_bits,
+    gray,
+    is_bayer,
+    raw_pixels,
     run_length_depth,
 )
-from mosaico_ingest.images.encodings import Pixels, RawImage, demosaic, eight_bits, gray, is_bayer, raw_pixels
 from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
 
 _GAP = 4

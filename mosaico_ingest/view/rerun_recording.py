@@ -13,7 +13,7 @@ import numpy as np
 from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import ViewError, missing_library
-from mosaico_ingest.images.depth import color_map
+from mosaico_ingest.images import color_map
 from mosaico_ingest.view.clouds import grid_pixels, has_grid, has_points, row_points
 from mosaico_ingest.view.images import decode_image, has_images
 from mosaico_ingest.view.logs import has_log, log_lines

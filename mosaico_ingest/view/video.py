@@ -13,7 +13,7 @@ import pyarrow as pa
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import ViewError, missing_library
-from mosaico_ingest.images.encodings import Pixels
+from mosaico_ingest.images import Pixels
 from mosaico_ingest.view.rows import last_rows
 
 _CODECS = {

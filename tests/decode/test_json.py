@@ -19,8 +19,7 @@ from mosaico_ingest.decode.json import JsonDecoder
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
-from mosaico_ingest.rosbag.encodings.json_inference import infer_definition
-from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec
+from mosaico_ingest.rosbag.encodings.json_messages import JsonCodec, infer_definition
 from mosaico_ingest.rosbag.encodings.json_schema import confirming_type, read_schema, validator_of
 
 KIND = {"title": "KIND", "type": "integer", "oneOf": [{"title": "A", "const": 0}, {"title": "B", "const": 1}]}

@@ -41,7 +41,7 @@ from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition
 from mosaico_ingest.rosbag.loader import ROSLoader
-from mosaico_ingest.rosbag.writers import open_writer
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 from mosaico_ingest.serve import Server, serve
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"

@@ -22,8 +22,8 @@ from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.writers import open_writer
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, encoding_of
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 
 pytestmark = pytest.mark.interop
 sdk = pytest.importorskip("mosaicolabs.bridges.ros", reason="the official SDK is not installed")

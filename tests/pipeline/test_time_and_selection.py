@@ -33,8 +33,8 @@ from mosaico_ingest.pipeline.topic import LATCHED_KEY
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 from mosaico_ingest.rosbag.serialization import Serializer
-from mosaico_ingest.rosbag.writers import open_writer
 
 PLAIN = define("std_msgs/msg/Int32", "int32 data")
 

@@ -5,9 +5,9 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions.distros import FILE, distro_type
 from mosaico_ingest.rosbag.definitions.distros_file import distros_file
-from mosaico_ingest.rosbag.definitions.idl import message_type
+from mosaico_ingest.rosbag.definitions.registry import FILE, distro_type
+from mosaico_ingest.rosbag.definitions.rosbags_types import message_type
 
 
 @pytest.mark.parametrize("distro", Stores)

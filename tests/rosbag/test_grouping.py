@@ -15,7 +15,7 @@ from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.job.values import FileNamePattern
-from mosaico_ingest.rosbag.grouping import group_splits, numbering_gaps
+from mosaico_ingest.rosbag.discovery import group_splits, numbering_gaps
 
 CORPUS = Path(__file__).parents[3] / "shared" / "corpus"
 INT = define("std_msgs/msg/Int32", "int32 data")

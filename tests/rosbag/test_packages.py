@@ -9,10 +9,9 @@ import pytest
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions import distros as packages
-from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
-from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Source
-from mosaico_ingest.rosbag.definitions.parser import read_types
+from mosaico_ingest.rosbag.definitions import registry as packages
+from mosaico_ingest.rosbag.definitions.linking import md5sum, rihs01
+from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Source, read_types
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.loader import ROSLoader
 from mosaico_ingest.rosbag.recording import Recording, open_recording

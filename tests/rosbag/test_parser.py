@@ -7,8 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.definitions.model import Constant, Container, Field
-from mosaico_ingest.rosbag.definitions.parser import parse_msg, read_types, sections
+from mosaico_ingest.rosbag.definitions.model import (
+    Constant,
+    Container,
+    Field,
+    parse_msg,
+    read_types,
+    sections,
+)
 
 
 def field_of(line: str) -> Field:

@@ -11,9 +11,8 @@ from rosbags.typesys import get_typestore
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions.distros import ros_version
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Source, normalize_msgtype
-from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
+from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver, ros_version
 
 BAR = "=" * 80
 

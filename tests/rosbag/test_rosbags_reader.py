@@ -13,8 +13,8 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding, ROSMessage
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.loader import ROSLoader
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 from mosaico_ingest.rosbag.serialization import Serializer
-from mosaico_ingest.rosbag.writers import open_writer
 
 HEADER = {"stamp": {"sec": 7, "nanosec": 8}, "frame_id": "base"}
 TYPES = {

@@ -175,7 +175,7 @@ def test_sqlite_of_server_without_ranges_larger_than_max_download_is_refused(
 def test_sqlite_without_apsw_is_downloaded_with_a_note_that_names_the_extra(
     server: WebServer, recordings: Any, large: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("mosaico_ingest.rosbag.opening.find_spec", lambda _: None)
+    monkeypatch.setattr("mosaico_ingest.rosbag.discovery.find_spec", lambda _: None)
     remote = serve(server, "large.db3", large.read_bytes())
     with open_recording(remote, resolve=recordings.blind) as there:
         assert there.message_count == 60_600

@@ -12,7 +12,7 @@ from made_recordings import define
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
-from mosaico_ingest.rosbag.writers import SqliteWriter, open_writer
+from mosaico_ingest.rosbag.rosbags_library import SqliteWriter, open_writer
 
 TEXT = define("std_msgs/msg/String", "string data\n")
 BLOB = define("acme_msgs/msg/Blob", "uint8[] data\n")

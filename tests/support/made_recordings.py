@@ -10,8 +10,8 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
+from mosaico_ingest.rosbag.rosbags_library import open_writer
 from mosaico_ingest.rosbag.serialization import Serializer
-from mosaico_ingest.rosbag.writers import open_writer
 
 Message = tuple[str, Definition, int, dict[str, Any]]
 

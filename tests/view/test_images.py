@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images.depth import color_map, run_length_depth
+from mosaico_ingest.images import color_map, run_length_depth
 from mosaico_ingest.view.images import contact_sheet, decode_image, fit_pixels, has_images, png_bytes
 
 HEIGHT, WIDTH = 6, 8

@@ -36,7 +36,7 @@ from mosaico_ingest.adapters.python import PythonAdapter
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language, MessageType
-from mosaico_ingest.rosbag.typestore import message_values, typestore_of
+from mosaico_ingest.rosbag.definitions.rosbags_types import message_values, typestore_of
 
 
 def differences(left: Array, right: Array) -> Mapping[str, Mask]:

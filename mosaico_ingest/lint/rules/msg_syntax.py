@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.lint.check import Check, MessageFile, Problem
-from mosaico_ingest.rosbag.definitions.parser import parse_msg
+from mosaico_ingest.rosbag.definitions.model import parse_msg
 
 
 def check(message: MessageFile) -> Iterator[Problem]:

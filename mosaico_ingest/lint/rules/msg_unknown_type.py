@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 from mosaico_ingest.lint.check import Check, MessageFile, Problem, is_defined
-from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES
+from mosaico_ingest.rosbag.definitions.model import PRIMITIVES
 from mosaico_ingest.rosbag.definitions.registry import suggest_type
 
 _SPECIAL_TYPES = frozenset({"time", "duration", "Header"})

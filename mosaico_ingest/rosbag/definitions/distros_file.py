@@ -8,9 +8,9 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions.distros import FILE
-from mosaico_ingest.rosbag.definitions.idl import message_type
-from mosaico_ingest.rosbag.definitions.parser import spell
+from mosaico_ingest.rosbag.definitions.model import spell
+from mosaico_ingest.rosbag.definitions.registry import FILE
+from mosaico_ingest.rosbag.definitions.rosbags_types import message_type
 
 
 def distros_file() -> str:

@@ -1,8 +1,9 @@
-"""Link a definition with the definitions it refers to, and derive its Arrow shape."""
+"""What is derived from a definition and those it refers to: links, Arrow shapes and hashes."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -10,17 +11,40 @@ from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError, DecodeError
 from mosaico_ingest.rosbag.definitions.model import (
+    BYTES,
     HEADER,
+    PRIMITIVES,
     Container,
     Definition,
     Field,
     MessageType,
     normalize_msgtype,
 )
-from mosaico_ingest.rosbag.definitions.parser import BYTES, PRIMITIVES
+
+if TYPE_CHECKING:
+    from rosbags.typesys.store import Typestore
 
 _MAX_DEPTH = 64
 _MAX_LEAVES = 20_000
+NUMBERS = {
+    "bool": "?",
+    "byte": "u1",
+    "char": "u1",
+    "uint8": "u1",
+    "int8": "i1",
+    "uint16": "u2",
+    "int16": "i2",
+    "uint32": "u4",
+    "int32": "i4",
+    "uint64": "u8",
+    "int64": "i8",
+    "float32": "f4",
+    "float64": "f8",
+}
+"""The numpy type of every primitive except strings, in the payload and in the column."""
+TEXTS = frozenset({"string", "wstring"})
+_ANY = "*"
+"""The MD5 sum that a ROS 1 subscriber writes to accept every form of a type."""
 
 
 def link(
@@ -48,6 +72,52 @@ def link(
         linked[message.name] = replace(message, fields=tuple(fields))
     _leaves(root.name, linked, {}, depth=0)
     return linked
+
+
+def ros_shape(definition: Definition) -> pa.StructType:
+    """Return the Arrow type of a message's rows. All fields are nullable; constants are not columns.
+
+    Definitions in languages other than ROS have their own shape.
+
+    Raises:
+        DecodeError: A type is recursive, or a primitive is unknown.
+    """
+    return _struct(definition, definition.message, ()) if definition.shape is None else definition.shape
+
+
+def rihs01(definition: Definition) -> str:
+    """Return the ROS 2 hash of a type.
+
+    Raises:
+        BagError: rosbags cannot hash the type.
+    """
+    try:
+        return _store(definition).hash_rihs01(definition.root)
+    except KeyError as error:  # rosbags raises KeyError for wstring and for service events
+        raise BagError(f"{definition.root} needs {error}, which has no hash") from error
+
+
+def md5sum(definition: Definition) -> str:
+    """Return the ROS 1 MD5 sum of a type.
+
+    Raises:
+        BagError: The type cannot be written in ROS 1.
+    """
+    return _store(definition).generate_msgdef(definition.root, ros_version=1)[1]
+
+
+def definition_difference(definition: Definition, attributes: Mapping[str, str]) -> str | None:
+    """Return how the hash of a definition differs from the recorded one; None if they are equal or unknown."""
+    if definition.ros_version == 1:
+        recorded, compute = attributes.get("md5sum", _ANY), md5sum
+    else:
+        recorded = attributes.get("type_description_hash") or attributes.get("topic_type_hash") or _ANY
+        compute = rihs01
+    try:
+        computed = recorded if recorded == _ANY else compute(definition)
+    except BagError:
+        return None
+    return None if computed == recorded else f"the recorded hash is {recorded}, the known one is {computed}"
 
 
 def _needed(
@@ -94,37 +164,6 @@ def _leaves(name: str, types: Mapping[str, MessageType], counts: dict[str, int],
     return counts[name]
 
 
-NUMBERS = {
-    "bool": "?",
-    "byte": "u1",
-    "char": "u1",
-    "uint8": "u1",
-    "int8": "i1",
-    "uint16": "u2",
-    "int16": "i2",
-    "uint32": "u4",
-    "int32": "i4",
-    "uint64": "u8",
-    "int64": "i8",
-    "float32": "f4",
-    "float64": "f8",
-}
-"""The numpy type of every primitive except strings, in the payload and in the column."""
-
-TEXTS = frozenset({"string", "wstring"})
-
-
-def ros_shape(definition: Definition) -> pa.StructType:
-    """Return the Arrow type of a message's rows. All fields are nullable; constants are not columns.
-
-    Definitions in languages other than ROS have their own shape.
-
-    Raises:
-        DecodeError: A type is recursive, or a primitive is unknown.
-    """
-    return _struct(definition, definition.message, ()) if definition.shape is None else definition.shape
-
-
 def _struct(definition: Definition, message: MessageType, within: tuple[str, ...]) -> pa.StructType:
     if message.name in within:
         raise DecodeError(f"type {message.name} contains itself", rule="definition", where=definition.root)
@@ -152,3 +191,14 @@ def _item(definition: Definition, field: Field, within: tuple[str, ...]) -> pa.D
             f"field {field.name} has the unknown type {field.type}", rule="definition", where=definition.root
         )
     return pa.from_numpy_dtype(np.dtype(NUMBERS[field.type]))
+
+
+def _store(definition: Definition) -> Typestore:
+    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 - slow to import, and few recordings carry hashes and no definitions
+
+    store = get_typestore(Stores.EMPTY)
+    try:
+        store.register(get_types_from_msg(definition.text, definition.root))
+    except TypesysError as error:
+        raise BagError(f"{definition.root} cannot be written: {error}") from error
+    return store

@@ -1,12 +1,20 @@
-"""Find the definition of a message type: recording, custom registration, distro."""
+"""Definitions by name: those shipped with the package, those that users register, and those in recordings.
+
+`distros.json` maps each type name to its forms (`.msg` text with full names) and the distros that use each form. It is
+generated from the type stores of rosbags, because importing those at run time is slow.
+
+`packages/` contains the fields of public packages; their licenses are listed in `packages/README.md`.
+"""
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from difflib import get_close_matches
 from enum import Enum
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -16,27 +24,41 @@ from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import BagError, DefinitionError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions.distros import (
-    BEFORE_IRON,
-    BUILTIN,
-    ROS1,
-    ROS2,
-    agreed_type,
-    distro_type,
-    package_type,
-    ros_version,
-)
 from mosaico_ingest.rosbag.definitions.linking import link
 from mosaico_ingest.rosbag.definitions.model import (
+    DURATION,
+    PRIMITIVES,
+    TIME,
     Definition,
     Embedded,
+    Field,
     MessageType,
+    RepeatedFieldError,
     Source,
+    flatten,
     normalize_msgtype,
+    parse_msg,
+    read_types,
 )
-from mosaico_ingest.rosbag.definitions.parser import PRIMITIVES, RepeatedFieldError, flatten, read_types
 
+FILE = Path(__file__).with_name("distros.json")
+_PARTS = (Field("sec", "int32"), Field("nanosec", "uint32"))
+BUILTIN: Mapping[str, MessageType] = {name: MessageType(name, _PARTS) for name in (TIME, DURATION)}
+"""The types that every distro has, and that ROS 1 calls `time` and `duration`."""
+ROS1 = (Stores.ROS1_NOETIC,)
+BEFORE_IRON = (
+    Stores.ROS2_DASHING, Stores.ROS2_ELOQUENT, Stores.ROS2_FOXY, Stores.ROS2_GALACTIC, Stores.ROS2_HUMBLE,
+)  # fmt: skip
+"""The distros whose recordings contain no definitions."""
+ROS2 = (*BEFORE_IRON, Stores.ROS2_IRON, Stores.ROS2_JAZZY, Stores.ROS2_KILTED, Stores.ROS2_LYRICAL)
+_FOLDER = Path(__file__).parent / "packages"
 _SUFFIXES = (".msg", ".idl")
+CustomMessages = tuple[str, Path, Stores | str | None]
+"""A package, the directory of its `.msg` files (or one file), and the distro that it applies to (None: all)."""
+_PACKAGE = "the public package "
+_OVERRIDE_HINT = "if your types have other fields, provide them with custom_msgs"
+_UNSPECIFIED = frozenset({"unknown", ""})
+_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSPECIFIED
 
 
 class Registered(Struct, frozen=True):
@@ -102,159 +124,6 @@ class ROSTypeRegistry:
     def reset(cls) -> None:
         """Remove all registered types."""
         cls._scopes.clear()
-
-
-def store_of(store: Stores | str | None) -> Stores | None:
-    """Return the distro with a name.
-
-    Raises:
-        BagError: The distro is unknown; the hint names the nearest.
-    """
-    if store is None:
-        return None
-    try:
-        # members of the enumeration of rosbags are accepted too
-        return Stores(store.value if isinstance(store, Enum) else store)
-    except ValueError:
-        names = [distro.value for distro in Stores]
-        near = get_close_matches(str(store), names, n=1)
-        hint = f"did you mean {near[0]}?" if near else f"the distros are {', '.join(names)}"
-        raise BagError(f"unknown distro {store!r}", hint=hint) from None
-
-
-def register_source(msg_type: str, source: Path | str) -> Registered:
-    """Parse one definition, from a file or text.
-
-    Raises:
-        BagError: The file cannot be read, or its text is invalid.
-    """
-    name = normalize_msgtype(msg_type)
-    if name.count("/") != 2:  # noqa: PLR2004 - pkg/msg/Name
-        raise BagError(f"{msg_type!r} is not the name of a message type", hint="write it as pkg/msg/Name")
-    text, where = (source, f"definition of {name}") if _is_text(source) else _read(Path(source))
-    file = None if _is_text(source) else Path(source)
-    try:
-        types = dict(read_types(str(text), name, where=where))
-    except BagError as error:
-        raise error if file is None else _syntax_error(error, file, str(text)) from error
-    if name not in types:
-        raise BagError(f"the text does not define {name}", where=where, hint=f"it defines {', '.join(types)}")
-    return Registered(name, str(text), types, file)
-
-
-def _syntax_error(error: BagError, file: Path, text: str) -> BagError:
-    """Return the error with a finding at its line of a definition file."""
-    line = (error.where or "").rpartition(":")[2]
-    if not line.isdigit():
-        return error
-    span = Span(str(file), int(line), 1, int(line), 1)
-    rule = "msg-syntax"
-    if isinstance(error, RepeatedFieldError):
-        rule = "msg-repeated-name"
-        declaration = re.search(rf"\s({re.escape(error.name)})\b", text.split("\n")[int(line) - 1])
-        column = declaration.start(1) + 1 if declaration else 1
-        span = Span(str(file), int(line), column, int(line), column + len(error.name))
-    finding = Finding(rule, Severity.ERROR, error.what, span, error.hint)
-    return DefinitionError(error.what, where=str(span), hint=error.hint, findings=(finding,))
-
-
-def _check_local_types(own: Sequence[Registered], public_names: Container[str]) -> None:
-    """Check that every field type without a package, which can only be in the same package, is defined.
-
-    Raises:
-        DefinitionError: A type is not defined; names the file and the line.
-    """
-    for entry in own:
-        package = entry.msgtype.partition("/")[0]
-        names = (
-            (field.name, field.type)
-            for message in entry.types.values()
-            for field in message.fields
-            if field.is_message and "/" not in field.type and field.type != "Header"
-        )
-        for name, msgtype in names:
-            if entry.file is not None and f"{package}/msg/{msgtype}" not in public_names:
-                raise _unknown_type(entry, entry.file, name, msgtype)
-
-
-def _unknown_type(entry: Registered, file: Path, name: str, msgtype: str) -> DefinitionError:
-    declaration = re.compile(rf"\s*(?P<type>{re.escape(msgtype)})\b.*\s{re.escape(name)}\b")
-    matches = enumerate(map(declaration.match, entry.text.splitlines()), 1)
-    line, column = next(((line, match.start("type") + 1) for line, match in matches if match), (1, 1))
-    span = Span(str(file), line, column, line, column + len(msgtype))
-    message, hint = f"the type {msgtype!r} is not defined", suggest_type(msgtype)
-    finding = Finding("msg-unknown-type", Severity.ERROR, message, span, hint)
-    return DefinitionError(message, where=str(span), hint=hint, findings=(finding,))
-
-
-def suggest_type(msgtype: str) -> str:
-    """Return a hint for a field type that is not defined."""
-    near = get_close_matches(msgtype, PRIMITIVES, n=1, cutoff=0.7)
-    if near:
-        return f"did you mean {near[0]}?"
-    return "define it under bag.custom_msgs" if "/" in msgtype else "put its .msg file next to this one"
-
-
-def _is_text(source: Path | str) -> bool:
-    """Return whether a source is a definition. A single line that ends with `.msg` or `.idl` is a path."""
-    if isinstance(source, Path) or not source.endswith(_SUFFIXES) or "\n" in source:
-        return isinstance(source, str)
-    return len(source.split()) > 1 and not Path(source).is_file()
-
-
-def _read(path: Path) -> tuple[str, str]:
-    try:
-        return read_limited(path).decode("utf-8-sig"), str(path)
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
-        raise BagError(f"cannot read the definition: {reason}", where=str(path)) from error
-
-
-def directory_types(package: str, path: Path) -> Iterator[Registered]:
-    """Parse the definitions of a package: the files in a directory or its `msg` folder, or a single file.
-
-    Raises:
-        BagError: There are no files, or one is invalid.
-    """
-    files = definition_files(path)
-    if not files:
-        there = "has no .msg or .idl file" if path.is_dir() else "does not exist"
-        raise BagError(
-            f"{path} {there}",
-            where=f"messages of {package}",
-            hint="name a directory with .msg files, or one file",
-        )
-    for file in files:
-        yield register_source(f"{package.removesuffix('/msg')}/msg/{file.stem}", file)
-
-
-def definition_files(path: Path) -> list[Path]:
-    """Return the definition files in a directory or its `msg` folder, or the file itself."""
-    if path.is_file():
-        return [path]
-    for folder in (path, path / "msg"):
-        if folder.is_dir():
-            files = sorted(file for file in folder.iterdir() if file.suffix in _SUFFIXES)
-            if files:
-                return files
-    return []
-
-
-CustomMessages = tuple[str, Path, Stores | str | None]
-"""A package, the directory of its `.msg` files (or one file), and the distro that it applies to (None: all)."""
-
-_PACKAGE = "the public package "
-_OVERRIDE_HINT = "if your types have other fields, provide them with custom_msgs"
-_UNSPECIFIED = frozenset({"unknown", ""})
-_LANGUAGES = frozenset({"ros1msg", "ros2msg", "ros2idl", "omgidl", "idl", "msg"}) | _UNSPECIFIED
-
-
-class _TypeSource(Struct, frozen=True):
-    """One of the sources that are searched for types."""
-
-    label: str
-    source: Source
-    find: Callable[[str], MessageType | None]
 
 
 class TypeResolver:
@@ -426,6 +295,216 @@ class TypeResolver:
             "provide it with custom_msgs" if self.distro else "set ros_distro, or provide it with custom_msgs"
         )
         return f"{searched}; {remedy}"
+
+
+def ros_version(distro: Stores) -> int | None:
+    """Return the ROS version of a distro, 1 or 2; None for `Stores.EMPTY`."""
+    if distro is Stores.EMPTY:
+        return None
+    return 1 if distro.value.startswith("ros1") else 2
+
+
+def distro_type(distro: Stores, name: str) -> MessageType | None:
+    """Return a distro's type by full name, None if the distro does not have it."""
+    forms = _distro_types().get(name, {})
+    text = next((text for having, text in forms.items() if distro.value in having.split()), None)
+    return None if text is None else _form(name, text)
+
+
+@lru_cache(maxsize=4096)
+def agreed_type(name: str, distros: tuple[Stores, ...]) -> MessageType | None:
+    """Return the newest form of a type if all distros that have it agree on its fields, else None."""
+    forms = [form for distro in distros if (form := distro_type(distro, name))]
+    return forms[-1] if forms and all(form.fields == forms[0].fields for form in forms) else None
+
+
+def package_type(name: str) -> MessageType | None:
+    """Return a ROS 2 type of a public package by full name, None if no shipped package has it."""
+    return _types(name.partition("/")[0]).get(name)
+
+
+def distro_definitions(msgtype: str, ros_version: int) -> tuple[tuple[str, Definition], ...]:
+    """Return the distinct definitions of a type in the distros of a ROS version, each with the newest distro that has it."""
+    definitions = dict[str, tuple[str, Definition]]()
+    for distro in ROS1 if ros_version == 1 else ROS2:
+        root = distro_type(distro, msgtype)
+        if root:
+            types = link(
+                root,
+                lambda name, distro=distro: distro_type(distro, name) or BUILTIN.get(name),
+                ros_version=ros_version,
+                hint="",
+            )
+            text = flatten(msgtype, types, ros_version=ros_version)
+            definitions[text] = distro.value, Definition(msgtype, types, Source.DISTRO, text, ros_version)
+    return tuple(definitions.values())
+
+
+def store_of(store: Stores | str | None) -> Stores | None:
+    """Return the distro with a name.
+
+    Raises:
+        BagError: The distro is unknown; the hint names the nearest.
+    """
+    if store is None:
+        return None
+    try:
+        # members of the enumeration of rosbags are accepted too
+        return Stores(store.value if isinstance(store, Enum) else store)
+    except ValueError:
+        names = [distro.value for distro in Stores]
+        near = get_close_matches(str(store), names, n=1)
+        hint = f"did you mean {near[0]}?" if near else f"the distros are {', '.join(names)}"
+        raise BagError(f"unknown distro {store!r}", hint=hint) from None
+
+
+def register_source(msg_type: str, source: Path | str) -> Registered:
+    """Parse one definition, from a file or text.
+
+    Raises:
+        BagError: The file cannot be read, or its text is invalid.
+    """
+    name = normalize_msgtype(msg_type)
+    if name.count("/") != 2:  # noqa: PLR2004 - pkg/msg/Name
+        raise BagError(f"{msg_type!r} is not the name of a message type", hint="write it as pkg/msg/Name")
+    text, where = (source, f"definition of {name}") if _is_text(source) else _read(Path(source))
+    file = None if _is_text(source) else Path(source)
+    try:
+        types = dict(read_types(str(text), name, where=where))
+    except BagError as error:
+        raise error if file is None else _syntax_error(error, file, str(text)) from error
+    if name not in types:
+        raise BagError(f"the text does not define {name}", where=where, hint=f"it defines {', '.join(types)}")
+    return Registered(name, str(text), types, file)
+
+
+def suggest_type(msgtype: str) -> str:
+    """Return a hint for a field type that is not defined."""
+    near = get_close_matches(msgtype, PRIMITIVES, n=1, cutoff=0.7)
+    if near:
+        return f"did you mean {near[0]}?"
+    return "define it under bag.custom_msgs" if "/" in msgtype else "put its .msg file next to this one"
+
+
+def directory_types(package: str, path: Path) -> Iterator[Registered]:
+    """Parse the definitions of a package: the files in a directory or its `msg` folder, or a single file.
+
+    Raises:
+        BagError: There are no files, or one is invalid.
+    """
+    files = definition_files(path)
+    if not files:
+        there = "has no .msg or .idl file" if path.is_dir() else "does not exist"
+        raise BagError(
+            f"{path} {there}",
+            where=f"messages of {package}",
+            hint="name a directory with .msg files, or one file",
+        )
+    for file in files:
+        yield register_source(f"{package.removesuffix('/msg')}/msg/{file.stem}", file)
+
+
+def definition_files(path: Path) -> list[Path]:
+    """Return the definition files in a directory or its `msg` folder, or the file itself."""
+    if path.is_file():
+        return [path]
+    for folder in (path, path / "msg"):
+        if folder.is_dir():
+            files = sorted(file for file in folder.iterdir() if file.suffix in _SUFFIXES)
+            if files:
+                return files
+    return []
+
+
+@cache
+def _distro_types() -> Mapping[str, Mapping[str, str]]:
+    return json.loads(FILE.read_bytes())
+
+
+@cache
+def _form(name: str, text: str) -> MessageType:
+    return parse_msg(text, name)
+
+
+@cache
+def _package_names() -> frozenset[str]:
+    return frozenset(path.stem for path in _FOLDER.glob("*.txt"))
+
+
+@cache
+def _types(package: str) -> Mapping[str, MessageType]:
+    if package not in _package_names():
+        return {}
+    path = _FOLDER / f"{package}.txt"
+    return read_types(path.read_text(encoding="utf-8"), package, where=str(path))
+
+
+def _syntax_error(error: BagError, file: Path, text: str) -> BagError:
+    """Return the error with a finding at its line of a definition file."""
+    line = (error.where or "").rpartition(":")[2]
+    if not line.isdigit():
+        return error
+    span = Span(str(file), int(line), 1, int(line), 1)
+    rule = "msg-syntax"
+    if isinstance(error, RepeatedFieldError):
+        rule = "msg-repeated-name"
+        declaration = re.search(rf"\s({re.escape(error.name)})\b", text.split("\n")[int(line) - 1])
+        column = declaration.start(1) + 1 if declaration else 1
+        span = Span(str(file), int(line), column, int(line), column + len(error.name))
+    finding = Finding(rule, Severity.ERROR, error.what, span, error.hint)
+    return DefinitionError(error.what, where=str(span), hint=error.hint, findings=(finding,))
+
+
+def _check_local_types(own: Sequence[Registered], public_names: Container[str]) -> None:
+    """Check that every field type without a package, which can only be in the same package, is defined.
+
+    Raises:
+        DefinitionError: A type is not defined; names the file and the line.
+    """
+    for entry in own:
+        package = entry.msgtype.partition("/")[0]
+        names = (
+            (field.name, field.type)
+            for message in entry.types.values()
+            for field in message.fields
+            if field.is_message and "/" not in field.type and field.type != "Header"
+        )
+        for name, msgtype in names:
+            if entry.file is not None and f"{package}/msg/{msgtype}" not in public_names:
+                raise _unknown_type(entry, entry.file, name, msgtype)
+
+
+def _unknown_type(entry: Registered, file: Path, name: str, msgtype: str) -> DefinitionError:
+    declaration = re.compile(rf"\s*(?P<type>{re.escape(msgtype)})\b.*\s{re.escape(name)}\b")
+    matches = enumerate(map(declaration.match, entry.text.splitlines()), 1)
+    line, column = next(((line, match.start("type") + 1) for line, match in matches if match), (1, 1))
+    span = Span(str(file), line, column, line, column + len(msgtype))
+    message, hint = f"the type {msgtype!r} is not defined", suggest_type(msgtype)
+    finding = Finding("msg-unknown-type", Severity.ERROR, message, span, hint)
+    return DefinitionError(message, where=str(span), hint=hint, findings=(finding,))
+
+
+def _is_text(source: Path | str) -> bool:
+    """Return whether a source is a definition. A single line that ends with `.msg` or `.idl` is a path."""
+    if isinstance(source, Path) or not source.endswith(_SUFFIXES) or "\n" in source:
+        return isinstance(source, str)
+    return len(source.split()) > 1 and not Path(source).is_file()
+
+
+def _read(path: Path) -> tuple[str, str]:
+    try:
+        return read_limited(path).decode("utf-8-sig"), str(path)
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "it is not UTF-8 text"
+        raise BagError(f"cannot read the definition: {reason}", where=str(path)) from error
+
+
+class _TypeSource(Struct, frozen=True):
+    """One of the sources that are searched for types."""
+
+    label: str
+    source: Source
+    find: Callable[[str], MessageType | None]
 
 
 def _is_empty(text: str) -> bool:

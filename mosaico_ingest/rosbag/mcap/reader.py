@@ -19,10 +19,10 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.attachments import Attachment
 from mosaico_ingest.rosbag.blocks import (
     EARLIEST_NS,
     LATEST_NS,
+    Attachment,
     Bytes,
     ChunkChecksum,
     Encoding,
@@ -48,15 +48,20 @@ from mosaico_ingest.rosbag.compression import (
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
 from mosaico_ingest.rosbag.mcap.index import (
+    RECORD,
+    ChannelRecord,
+    ChunkHead,
     Extent,
     KeptRecords,
     McapIndex,
+    Op,
+    SchemaRecord,
     attachment_chunks,
+    chunk_head,
     read_extents,
     read_index,
     read_kept_records,
 )
-from mosaico_ingest.rosbag.mcap.records import RECORD, ChannelRecord, ChunkHead, Op, SchemaRecord, chunk_head
 from mosaico_ingest.rosbag.source import ReadBuffer, Source
 
 _ENCODINGS = {

@@ -13,10 +13,10 @@ import zstandard
 
 from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.attachments import Attachment
+from mosaico_ingest.rosbag.blocks import Attachment
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, short_msgtype
-from mosaico_ingest.rosbag.encodings.table import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.mcap.records import RECORD, Op, record_bytes, text_bytes, texts_bytes
+from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, encoding_of
+from mosaico_ingest.rosbag.mcap.index import RECORD, Op, record_bytes, text_bytes, texts_bytes
 from mosaico_ingest.version import __version__
 
 _CHUNK_BYTES = 4 << 20

@@ -39,14 +39,16 @@ from mosaico_ingest.rosbag.compression import (
     decompression_groups,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.ros1.index import Extent, Ros1Index, read_index
-from mosaico_ingest.rosbag.ros1.records import (
+from mosaico_ingest.rosbag.ros1.index import (
     ChunkHead,
+    Extent,
     Op,
+    Ros1Index,
     chunk_head,
     index_entries,
     messages_in,
     number,
+    read_index,
     records_in,
     time_of,
     times_of,

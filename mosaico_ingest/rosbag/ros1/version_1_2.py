@@ -28,7 +28,7 @@ from mosaico_ingest.rosbag.blocks import (
     rows_by_connection,
 )
 from mosaico_ingest.rosbag.definitions.model import Embedded
-from mosaico_ingest.rosbag.ros1.records import Header, Record, find_message, number, record_at
+from mosaico_ingest.rosbag.ros1.index import Header, Record, find_message, number, record_at
 from mosaico_ingest.rosbag.source import Source, Window
 
 _DEFINITION, _MESSAGE, _FILE = 1, 2, 3

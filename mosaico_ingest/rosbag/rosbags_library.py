@@ -1,26 +1,54 @@
-"""Writers of recordings: ROS 1 bags and rosbag2 SQLite files by rosbags, and the choice of a writer by suffix."""
+"""The rosbags library as the writer of ROS 1 bags and rosbag2 SQLite files, and as the reference that tests of the readers compare with."""
 
 from __future__ import annotations
 
+import keyword
 import shutil
 import sqlite3
 import tempfile
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Protocol, runtime_checkable
+from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
+from rosbags.highlevel import AnyReader, AnyReaderError
 from rosbags.interfaces import Connection as RosbagsConnection
+from rosbags.interfaces.typing import Typesdict
 from rosbags.rosbag1 import Writer as Rosbag1
 from rosbags.rosbag2 import StoragePlugin
 from rosbags.rosbag2 import Writer as Rosbag2
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores as RosbagsStores
+from rosbags.typesys import TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 from mosaico_ingest.containers import SUFFIX_LIST
-from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.attachments import Attachment
-from mosaico_ingest.rosbag.definitions.hashes import md5sum, rihs01
-from mosaico_ingest.rosbag.definitions.model import Definition, Language
+from mosaico_ingest.errors import BagError, DecodeError
+from mosaico_ingest.job.values import Stores
+from mosaico_ingest.rosbag.blocks import Attachment, Connection, Encoding
+from mosaico_ingest.rosbag.definitions.linking import md5sum, rihs01
+from mosaico_ingest.rosbag.definitions.model import (
+    BYTES,
+    Container,
+    Definition,
+    Language,
+    MessageType,
+    normalize_msgtype,
+)
+from mosaico_ingest.rosbag.definitions.rosbags_types import message_type
 from mosaico_ingest.rosbag.mcap.writer import McapWriter
+
+_ERRORS = (
+    AnyReaderError,
+    TypesysError,
+    SerdeError,
+    AssertionError,
+    ArithmeticError,
+    LookupError,
+    TypeError,
+    ValueError,
+)
+"""Exceptions that rosbags raises for recordings, definitions and messages that it cannot read."""
 
 
 class RecordingWriter(Protocol):
@@ -167,6 +195,79 @@ _WRITERS: dict[str, Callable[[Path], RecordingWriter]] = {
 }
 
 
+class RosbagsRecording:
+    """A recording opened with `rosbags.highlevel.AnyReader`."""
+
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        distro: Stores | None = None,
+        definitions: Mapping[str, str] | None = None,
+    ) -> None:
+        """Open the files; `distro` and `definitions` describe types for recordings without embedded definitions.
+
+        Raises:
+            BagError: rosbags cannot open the recording.
+        """
+        store = get_typestore(RosbagsStores((distro or Stores.EMPTY).value))
+        try:
+            for msgtype, text in (definitions or {}).items():
+                store.register(_types_from_text(msgtype, text))
+            self._reader = AnyReader(paths, default_typestore=store if store.fielddefs else None)
+            self._reader.open()
+        except (*_ERRORS, OSError) as error:
+            what = (
+                f"rosbags cannot open the recording: {' '.join(str(error).split()) or type(error).__name__}"
+            )
+            raise BagError(
+                what, where=str(paths[0]), hint="use the native reader, or set ros_distro"
+            ) from error
+        self._rosbags_connections = list(self._reader.connections)
+        encoding = Encoding.CDR if self._reader.is2 else Encoding.ROS1
+        self.connections = tuple(
+            Connection(
+                number, one.topic, normalize_msgtype(one.msgtype), encoding, one.msgcount, definition=None
+            )
+            for number, one in enumerate(self._rosbags_connections)
+        )
+
+    def close(self) -> None:
+        """Close the files. Closing twice is harmless."""
+        if self._reader.stack:
+            self._reader.close()
+
+    def time_bounds(self) -> tuple[int, int]:
+        """Return the log times of the first and last message, nanoseconds since the epoch."""
+        return self._reader.start_time, self._reader.end_time - 1
+
+    def payloads(self, connection_ids: Collection[int]) -> Iterator[tuple[int, int, bytes]]:
+        """Yield log time, connection id and payload of each message, by log time.
+
+        Raises:
+            BagError: rosbags cannot read a part of the recording.
+        """
+        selected = [self._rosbags_connections[number] for number in connection_ids]
+        ids = {id(connection): number for number, connection in enumerate(self._rosbags_connections)}
+        try:
+            for connection, log_ns, payload in self._reader.messages(selected):
+                yield log_ns, ids[id(connection)], bytes(payload)
+        except (*_ERRORS, OSError) as error:
+            raise BagError(f"rosbags cannot read the recording: {error}") from error
+
+    def deserializer(self, connection: Connection) -> Callable[[bytes], dict[str, Any]]:
+        """Return a function that decodes a payload to a dictionary, and raises DecodeError for invalid bytes."""
+        msgtype = self._rosbags_connections[connection.id].msgtype
+
+        def deserialize(payload: bytes) -> dict[str, Any]:
+            try:
+                message = self._reader.deserialize(payload, msgtype)
+                return _to_dict(message, msgtype, self._reader.typestore.fielddefs)
+            except _ERRORS as error:
+                raise DecodeError(f"rosbags: {error}", rule="decode", where=msgtype) from error
+
+        return deserialize
+
+
 def check_new_recording(path: Path, *, replace: bool = False) -> None:
     """Check that a recording can be created at a path.
 
@@ -213,3 +314,31 @@ def open_writer(path: Path, *, replace: bool = False) -> Generator[RecordingWrit
 def _not_ros(topic: str, definition: Definition) -> BagError:
     message = f"{definition.root} is a {definition.language.value} type, not a ROS type"
     return BagError(message, where=topic, hint="write .mcap")
+
+
+def _types_from_text(msgtype: str, text: str) -> Typesdict:
+    if "module " in text:
+        return get_types_from_idl(text)
+    return get_types_from_msg(text, msgtype)
+
+
+def _to_dict(message: object, msgtype: str, types: Typesdict) -> dict[str, Any]:
+    """Return the fields of a rosbags message in the form of `serialization.Deserializer.to_dict`."""
+    definition: MessageType = message_type(msgtype, types)
+    values: dict[str, Any] = {}
+    for field in definition.fields:
+        value = getattr(message, f"{field.name}_" if keyword.iskeyword(field.name) else field.name)
+        if field.is_message:
+            if field.container is Container.SCALAR:
+                values[field.name] = _to_dict(value, field.type, types)
+            else:
+                values[field.name] = [_to_dict(item, field.type, types) for item in value]
+        elif field.type in BYTES:
+            unsigned = np.asarray(value).astype(np.uint8)  # rosbags reads `byte` as a signed number
+            if field.container is Container.SEQUENCE:
+                values[field.name] = unsigned.tobytes()
+            else:
+                values[field.name] = unsigned.tolist()
+        else:
+            values[field.name] = value.tolist() if isinstance(value, np.ndarray) else value
+    return values

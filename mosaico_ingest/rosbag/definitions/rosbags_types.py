@@ -1,22 +1,73 @@
-"""The typestores of the rosbags library: their definitions as text, and their message objects."""
+"""Types of the rosbags library: IDL text that it parses, and its typestores with their definitions and message objects."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
 from rosbags.interfaces import Nodetype
+from rosbags.interfaces.typing import FieldDesc, Typesdict
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 from mosaico_ingest.errors import BagError
-from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, normalize_msgtype
+from mosaico_ingest.rosbag.definitions.model import (
+    Constant,
+    Container,
+    Definition,
+    Embedded,
+    Field,
+    MessageType,
+    normalize_msgtype,
+)
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 
 if TYPE_CHECKING:
     from rosbags.typesys.store import Typestore
 
+_NOT_CODE = re.compile(r"//[^\n]*|/\*.*?\*/|\"(?:\\.|[^\"\\])*\"", re.DOTALL)
+_PLACEHOLDER = "structure_needs_at_least_one_member"
+_CONTAINERS = {Nodetype.ARRAY: Container.ARRAY, Nodetype.SEQUENCE: Container.SEQUENCE}
+_IDL_ERRORS = (
+    TypesysError,
+    AssertionError,
+    LookupError,
+    TypeError,
+    ValueError,
+    ArithmeticError,
+    RecursionError,
+)
+"""Exceptions that the parser of rosbags raises for invalid IDL."""
 _HEADER = "std_msgs/msg/Header"
+
+
+def read_idl(text: str, *, where: str) -> list[MessageType]:
+    """Return every type that `text` defines; `where` is its location in error messages.
+
+    Raises:
+        BagError: The text is not valid IDL.
+    """
+    if "<<" in _NOT_CODE.sub("", text):
+        # No ROS message uses shifts, and one line with a large shift could exhaust the memory.
+        raise BagError("shifts in IDL constants are not supported", where=where)
+    try:
+        types = get_types_from_idl(text)
+    except _IDL_ERRORS as error:
+        reason = " ".join(str(error).split())[-200:]
+        raise BagError(f"cannot parse the IDL: {reason}", where=where) from None
+    return [message_type(name, types) for name in types]
+
+
+def message_type(name: str, types: Typesdict) -> MessageType:
+    """Convert a type of rosbags."""
+    constants, fields = types[name]
+    return MessageType(
+        name,
+        tuple(_field(field, desc) for field, desc in fields if field != _PLACEHOLDER),
+        tuple(Constant(constant, kind, value) for constant, kind, value in constants),
+    )
 
 
 def definition_texts(typestore: Typestore) -> dict[str, str]:
@@ -44,8 +95,6 @@ def typestore_of(definition: Definition) -> Typestore:
     Raises:
         BagError: rosbags cannot parse the definition.
     """
-    from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore  # noqa: PLC0415 - slow to import, and only exports of adapters in Python need it
-
     store = get_typestore(Stores.EMPTY)
     try:
         store.register(get_types_from_msg(definition.text, definition.root))
@@ -69,18 +118,6 @@ def message_values(message: Any, shape: pa.StructType) -> dict[str, Any]:  # noq
     }
 
 
-def _plain(value: Any, kind: Any) -> Any:  # noqa: ANN401 - any field value and its type
-    if pa.types.is_struct(kind):
-        return message_values(value, kind)
-    if pa.types.is_binary(kind) or pa.types.is_fixed_size_binary(kind):
-        return bytes(value)
-    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
-        if isinstance(value, np.ndarray):
-            return value.tolist()
-        return [_plain(item, kind.value_type) for item in value]
-    return value
-
-
 def native_message(typestore: Typestore, msgtype: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401 - a generated class
     """Return the message object of a typestore with the field values of a dictionary."""
     fields: dict[str, Any] = {}
@@ -92,6 +129,35 @@ def native_message(typestore: Typestore, msgtype: str, values: Mapping[str, Any]
             value = _native_list(typestore, detail[0], value)
         fields[name] = value
     return typestore.types[msgtype](**fields)
+
+
+def _field(name: str, desc: FieldDesc) -> Field:
+    if desc[0] == Nodetype.BASE:
+        return Field(name, desc[1][0], string_bound=desc[1][1])
+    if desc[0] == Nodetype.NAME:
+        return Field(name, desc[1], is_message=True)
+    element, size = desc[1]
+    plain = _field(name, element)
+    return Field(
+        name,
+        plain.type,
+        plain.is_message,
+        _CONTAINERS[Nodetype(desc[0])],
+        size,
+        string_bound=plain.string_bound,
+    )
+
+
+def _plain(value: Any, kind: Any) -> Any:  # noqa: ANN401 - any field value and its type
+    if pa.types.is_struct(kind):
+        return message_values(value, kind)
+    if pa.types.is_binary(kind) or pa.types.is_fixed_size_binary(kind):
+        return bytes(value)
+    if pa.types.is_list(kind) or pa.types.is_fixed_size_list(kind):
+        if isinstance(value, np.ndarray):
+            return value.tolist()
+        return [_plain(item, kind.value_type) for item in value]
+    return value
 
 
 def _native_list(typestore: Typestore, element: Any, values: Any) -> Any:  # noqa: ANN401 - rosbags' nested tuples
