@@ -18,7 +18,7 @@ from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.compaction import compact
 from mosaico_ingest.job.values import Compression, IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 SAMPLE = OntologyType("Sample", pa.struct([pa.field("value", pa.float64()), pa.field("count", pa.int32())]))
 ROWS = 100

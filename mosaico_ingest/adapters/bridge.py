@@ -21,27 +21,27 @@ from typing import TYPE_CHECKING, Any, Literal, cast
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.adapter import AdapterSpec, UnmodeledSpec
+from mosaico_ingest.adapters.adapter import AdapterSpec, EncodedImageSpec, UnmodeledSpec
 from mosaico_ingest.adapters.builtin import BY_NAME, BY_TYPE, Builtin
-from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, load_adapter
-from mosaico_ingest.adapters.permission import is_python_allowed, python_refusal
 from mosaico_ingest.adapters.python import (
     PythonAdapterSpec,
     ROSAdapterBase,
     is_adapter_class,
+    is_python_allowed,
+    python_refusal,
     registered_adapters,
 )
 from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.fields import ImageFormat, ImageSettings, ParameterizedAdapter, image_settings
 from mosaico_ingest.job.values import first_match
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job
-    from mosaico_ingest.ontology.header import Message
+    from mosaico_ingest.ontology.model import Message
     from mosaico_ingest.rosbag.blocks import ROSMessage
 
 _MAPPING_SUFFIXES = frozenset({".yaml", ".yml"})

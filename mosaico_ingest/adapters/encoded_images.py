@@ -17,7 +17,7 @@ from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.images import RawImage
 from mosaico_ingest.images.files import EncodedImage, encode_image, require_pillow
 from mosaico_ingest.job.fields import ImageSettings
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 IMAGE_METADATA_KEY = "_image_"
 """Reserved key of topic metadata: the settings, and the encoding and size of the first image before its conversion."""

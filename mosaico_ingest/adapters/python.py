@@ -1,29 +1,63 @@
-"""Adapters written in Python: the base class, the registry of defaults, and their execution."""
+"""Adapters written in Python: permission, the base class, the registry of defaults, and their execution.
+
+The environment variable `MOSAICO_NO_PYTHON`, which `ingest --no-python` sets, refuses them for the process and the
+processes that it starts; the manifest key `adapters.python` refuses them for one job.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
+import traceback
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
-from inspect import signature
+from functools import lru_cache
+from inspect import signature, unwrap
 from typing import TYPE_CHECKING, Any, Generic, TypeVar, cast, overload
 
 import numpy as np
 import pyarrow as pa
 from msgspec import Struct
+from pyarrow import types as pt
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
-from mosaico_ingest.adapters.python_errors import error_text, location_of, rejection
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.model import Definition, normalize_msgtype
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.header import Header, Message
-    from mosaico_ingest.ontology.model import Serializable
+    from mosaico_ingest.ontology.model import Header, Message, Serializable
+if TYPE_CHECKING:
+    from mosaico_ingest.adapters.adapter import Envelope
+    from mosaico_ingest.adapters.mapping.columns import DataType
+
+NO_PYTHON = "MOSAICO_NO_PYTHON"
+"""The environment variable that refuses adapters in Python, unless it is empty or `0`."""
+
+
+def is_python_allowed() -> bool:
+    """Return whether this process may run adapters in Python."""
+    return os.environ.get(NO_PYTHON, "") in {"", "0"}
+
+
+def is_python_reference(reference: object) -> bool:
+    """Return whether a value of `adapters` is a class, `module:Class` or `file.py:Class`."""
+    module, colon, name = str(reference).rpartition(":")
+    return isinstance(reference, type) or bool(colon and module and name)
+
+
+def python_refusal(reference: str) -> tuple[str, str]:
+    """Return the message and the hint for a reference to an adapter in Python that is refused."""
+    if is_python_allowed():
+        return (
+            f"{reference} is Python code, which adapters.python refuses",
+            "write it as YAML, or allow Python",
+        )
+    return f"{reference} is Python code, which --no-python refuses", "write it as YAML, or allow Python"
+
 
 T = TypeVar("T", bound="Serializable")
 A = TypeVar("A", bound=type[Any])
@@ -53,7 +87,7 @@ class ROSAdapterBase(ABC, Generic[T]):
     @classmethod
     def translate(cls, ros_msg: ROSMessage, **kwargs: Any) -> Message:  # noqa: ANN401 - passed on to from_dict
         """Return the object with its time. Override it if the result depends on the topic or time of the message."""
-        from mosaico_ingest.ontology.header import Message  # noqa: PLC0415 - the models are slow to import
+        from mosaico_ingest.ontology.model import Message  # noqa: PLC0415 - the models are slow to import
 
         convert: Callable[..., T] = cls.from_dict  # An override may accept more arguments.
         return Message(timestamp_ns=ros_msg.bag_timestamp_ns, data=convert(ros_msg.data, **kwargs))
@@ -91,7 +125,7 @@ class ROSAdapterBase(ABC, Generic[T]):
     @classmethod
     def unpack_mosaico_msg(cls, mosaico_msg: Message | T) -> tuple[T, Header]:
         """Return the ontology object of a message and its header, which is empty if the object has none."""
-        from mosaico_ingest.ontology.header import Header, Message, Time  # noqa: PLC0415 - the models are slow to import
+        from mosaico_ingest.ontology.model import Header, Message, Time  # noqa: PLC0415 - the models are slow to import
 
         data = cast("T", mosaico_msg.data if isinstance(mosaico_msg, Message) else mosaico_msg)
         header: Header | None = getattr(data, "header", None)
@@ -237,7 +271,7 @@ class PythonAdapter(Struct, frozen=True):
 
     def to_ros(self, row: dict[str, Any], log_ns: int, typestore: Any, msgtype: str) -> Any:  # noqa: ANN401 - rosbags' class, and a message object
         """Return the message for one row of ontology columns; any exception of the class is passed on."""
-        from mosaico_ingest.ontology.header import Message  # noqa: PLC0415 - the models are slow to import
+        from mosaico_ingest.ontology.model import Message  # noqa: PLC0415 - the models are slow to import
 
         model = self.adapter.__mosaico_ontology_type__
         # The SDK's models have no from_row.
@@ -446,3 +480,81 @@ def _joined(parts: Sequence[pa.StructArray], struct: pa.StructType) -> pa.Struct
     if len(parts) == 1:
         return parts[0]
     return cast("pa.StructArray", pa.concat_arrays(parts) if parts else pa.array([], struct))
+
+
+_FIELDS = 40
+"""Maximum number of fields in a reason."""
+
+
+def rejection(
+    adapter: type[Any],
+    method: str,
+    problem: Exception | str,
+    *,
+    row: int,
+    envelope: Envelope,
+    shape: pa.DataType,
+) -> RowFailure:
+    """Return the failure of one message of a batch; `problem` is an exception of the method, or the problem in words.
+
+    The reason contains the line of the adapter, the index of the message in its topic, its log time and its fields.
+    """
+    index = row if envelope.indices is None else int(envelope.indices[row])
+    if isinstance(problem, Exception):
+        text, location = error_text(problem), location_of(adapter, method, problem)
+    else:
+        text, location = problem, location_of(adapter, method)
+    message = f"message {index}, log time {int(envelope.log_times[row])} ns; fields: {_field_names(shape)}"
+    details = f"{location}, {message}" if location else message
+    return RowFailure(row, "adapter-rejected", f"{adapter.__name__}: {text} ({details})")
+
+
+def error_text(error: Exception) -> str:
+    """Return an exception in one line."""
+    text = " ".join(str(error).split())
+    return f"{type(error).__name__}: {text}" if text else type(error).__name__
+
+
+def location_of(adapter: type[Any], method: str, error: Exception | None = None) -> str:
+    """Return `file:line` of an exception in the files of an adapter class, else of the method; "" if it has no source.
+
+    The deepest line in these files is the location, so the location of an exception in a library is the adapter's call.
+    """
+    codes = list(_codes(adapter))
+    files = {code.co_filename for code in codes}
+    frames = traceback.extract_tb(error.__traceback__) if error is not None else []
+    lines = [f"{frame.filename}:{frame.lineno}" for frame in frames if frame.filename in files]
+    if lines:
+        return lines[-1]
+    own = next((code for code in codes if code.co_name == method), None)
+    return f"{own.co_filename}:{own.co_firstlineno}" if own else ""
+
+
+def _codes(adapter: type[Any]) -> Iterator[Any]:
+    """Yield the code of the methods of an adapter class and its bases, without the bases of this package and the SDK."""
+    for owner in adapter.__mro__:
+        if owner.__name__ == "ROSAdapterBase":
+            return
+        for value in vars(owner).values():
+            code = getattr(unwrap(getattr(value, "__func__", value)), "__code__", None)
+            if code is not None:
+                yield code
+
+
+@lru_cache(maxsize=64)
+def _field_names(shape: pa.DataType) -> str:
+    """Return the fields of a message type, including nested messages, as adapters access them."""
+    names = list(_paths(shape, ""))
+    more = f", … ({len(names) - _FIELDS} more)" if len(names) > _FIELDS else ""
+    return ", ".join(names[:_FIELDS]) + more if names else "none"
+
+
+def _paths(shape: DataType, prefix: str) -> Iterator[str]:
+    for each in shape:
+        path, type_ = f"{prefix}{each.name}", each.type
+        while pt.is_list(type_) or pt.is_large_list(type_) or pt.is_fixed_size_list(type_):
+            path, type_ = f"{path}[]", type_.value_type
+        if pt.is_struct(type_) and type_.num_fields:
+            yield from _paths(type_, f"{path}.")
+        else:
+            yield path.removesuffix("[]")

@@ -43,7 +43,7 @@ GROUP_HELP = {
 }
 """The help of groups whose commands `ingest --help` need not import."""
 NO_PYTHON = "MOSAICO_NO_PYTHON"
-"""As `adapters.permission.NO_PYTHON`, which takes longer to import."""
+"""As `adapters.python.NO_PYTHON`, which takes longer to import."""
 NAMES = (*COMMANDS, *GROUPS)
 COMPLETING = "_INGEST_COMPLETE" in os.environ
 """Whether a shell asks for completions."""

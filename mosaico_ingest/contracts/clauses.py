@@ -29,7 +29,7 @@ from mosaico_ingest.report.units import count_text
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.types import OntologyType
+    from mosaico_ingest.ontology.registry import OntologyType
 
 KeyPath = tuple[str | int, ...]
 TIME_KEYS = frozenset({"rate", "sliding_rate", "gap", "gaps", "messages", "coverage", "start", "end"})

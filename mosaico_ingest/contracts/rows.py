@@ -13,12 +13,23 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.analyzer import Analyzer
-from mosaico_ingest.adapters.mapping.checker import Scope
-from mosaico_ingest.adapters.mapping.columns import Array, Axis, arrays, field_of, null_mask, pc, pt, time_ns
+from mosaico_ingest.adapters.mapping.checker import Analyzer, Scope
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    Axis,
+    ExprType,
+    arrays,
+    field_of,
+    format_type,
+    is_list,
+    is_number,
+    null_mask,
+    pc,
+    pt,
+    time_ns,
+)
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
-from mosaico_ingest.adapters.mapping.types import ExprType, format_type, is_list, is_number
 from mosaico_ingest.contracts.clauses import HEADER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic, other_types
 from mosaico_ingest.contracts.values import (
     Accumulator,
@@ -40,7 +51,7 @@ from mosaico_ingest.contracts.values import (
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.expect import FieldExpectations
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.rosbag.blocks import Connection
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, MessageType

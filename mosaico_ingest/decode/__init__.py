@@ -4,9 +4,9 @@ A message that does not fit its definition becomes a rejected row and affects no
 depend on containers, adapters or destinations.
 
     definition ── layout ─────────────┐
-    message block ── locate ── positions ── columns ── rows
+    message block ── locate ── positions ── decoder ── rows
 
 `layout` compiles a definition to a list of steps. `locate` finds the position of each step in all messages without
-reading a value, and `columns` then copies each column in one operation. Messages that these stages cannot verify fall
+reading a value, and `decoder` then copies each column in one operation. Messages that these stages cannot verify fall
 back to the row-wise decoder, which is authoritative.
 """

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 from pyarrow.json import ParseOptions, ReadOptions, read_json
 
-from mosaico_ingest.decode.base import Decoded, DictDecoder, merge_parts
+from mosaico_ingest.decode.decoder import Decoded, DictDecoder, merge_parts
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

@@ -29,8 +29,8 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from ptars import HandlerPool
 
-from mosaico_ingest.decode.base import Decoded, DictDecoder
-from mosaico_ingest.decode.spans import Array, array_of, copy_slices, list_offsets
+from mosaico_ingest.decode.decoder import Decoded, DictDecoder
+from mosaico_ingest.decode.layout import Array, array_of, copy_slices, list_offsets
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

@@ -30,7 +30,7 @@ from mosaico_ingest.job.values import (
     StoreTarget,
     Target,
 )
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 ENVELOPE = pa.field("timestamp_ns", pa.int64(), nullable=False)
 """The first column of every batch: the log time of the message, ns since the epoch."""

@@ -23,7 +23,7 @@ from mosaico_ingest.destinations.base import (
 )
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 
 @dataclass(slots=True)

@@ -8,7 +8,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.ontology.types import PLAIN_TYPES
+from mosaico_ingest.ontology.registry import PLAIN_TYPES
 
 _arrow: Any = pa
 """pyarrow, whose stubs do not accept `type` together with `mask`."""

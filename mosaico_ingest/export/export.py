@@ -31,7 +31,7 @@ from mosaico_ingest.export.kept import write_kept
 from mosaico_ingest.export.sources import SourceSequence, SourceTopic, StoreSequence
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import Stores, select
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of

@@ -12,7 +12,7 @@ from mosaico_ingest.destinations.store.model import AttachmentInfo
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.export.columns import comparable
 from mosaico_ingest.findings import suggest_names
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol.messages import TopicInfo as ServerTopic
 from mosaico_ingest.protocol.messages import topic_name
 

@@ -30,11 +30,14 @@ if TYPE_CHECKING:
         Vector4d,
         Velocity,
     )
-    from mosaico_ingest.ontology.header import Duration, Header, Message, Time
-    from mosaico_ingest.ontology.imaging import ROI, CameraInfo, CompressedImage, Image, ImageFormat
-    from mosaico_ingest.ontology.model import Serializable
-    from mosaico_ingest.ontology.ranging import (
+    from mosaico_ingest.ontology.model import Duration, Header, Message, Serializable, Time
+    from mosaico_ingest.ontology.perception import (
+        ROI,
+        CameraInfo,
+        CompressedImage,
         GridCells,
+        Image,
+        ImageFormat,
         LaserScan,
         Lidar,
         MapMetadata,
@@ -49,6 +52,7 @@ if TYPE_CHECKING:
         StereoCamera,
         ToFCamera,
     )
+    from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
     from mosaico_ingest.ontology.scalars import (
         Boolean,
         Floating16,
@@ -77,7 +81,6 @@ if TYPE_CHECKING:
         RobotJoint,
         Temperature,
     )
-    from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
 
 __all__ = [
     "GPS",
@@ -149,12 +152,12 @@ __all__ = [
 ]
 
 _OTHERS = {
-    "ImageFormat": "imaging",
-    "Message": "header",
-    "OntologyType": "types",
-    "PointFieldDataType": "ranging",
+    "ImageFormat": "perception",
+    "Message": "model",
+    "OntologyType": "registry",
+    "PointFieldDataType": "perception",
     "Serializable": "model",
-    "SerializationFormat": "types",
+    "SerializationFormat": "registry",
 }
 """The module of each name that is not a tag."""
 

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import json
 
-from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, encode_fields, model
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, OntologyType, encode_fields, model
 
 
 def columns_file() -> str:

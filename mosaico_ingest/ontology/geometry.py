@@ -8,8 +8,7 @@ from typing import Annotated
 from pydantic import BaseModel, model_validator
 from typing_extensions import Self
 
-from mosaico_ingest.ontology.header import Stamped
-from mosaico_ingest.ontology.model import FixedSize, Float64, Int16, Nullable, Serializable
+from mosaico_ingest.ontology.model import FixedSize, Float64, Int16, Nullable, Serializable, Stamped
 
 
 class Uncertain(Stamped):

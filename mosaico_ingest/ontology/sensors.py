@@ -5,8 +5,7 @@ from __future__ import annotations
 from typing_extensions import Self
 
 from mosaico_ingest.ontology.geometry import Point3d, Quaternion, Varying, Vector3d
-from mosaico_ingest.ontology.header import Stamped
-from mosaico_ingest.ontology.model import Float32, Float64, Int8, Int32, Serializable, UInt8, UInt16
+from mosaico_ingest.ontology.model import Float32, Float64, Int8, Int32, Serializable, Stamped, UInt8, UInt16
 
 
 class IMU(Stamped, Serializable):

@@ -19,7 +19,7 @@ from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters, suggest_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
 from mosaico_ingest.adapters.mapping.loader import MappingSpec, parameter_problem
-from mosaico_ingest.adapters.permission import is_python_allowed, is_python_reference, python_refusal
+from mosaico_ingest.adapters.python import is_python_allowed, is_python_reference, python_refusal
 from mosaico_ingest.containers import RECORDING_NAME
 from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError, ManifestError, NothingMatched

@@ -20,7 +20,7 @@ from mosaico_ingest.errors import ContractError, IngestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.values import LockFile, OnSchemaChange
 from mosaico_ingest.job.yaml_source import KeyPath, load_source
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.report.units import counted

@@ -12,8 +12,7 @@ from typing import Annotated, Any
 from pydantic import Field, JsonValue, PlainSerializer, SerializationInfo
 from typing_extensions import TypedDict
 
-from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec
-from mosaico_ingest.adapters.image import EncodedImageSpec
+from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec, EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.destinations.base import destination_of
@@ -22,7 +21,7 @@ from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import ErrorPolicy, QuarantineSettings, SequenceSettings
 from mosaico_ingest.job.split import SequencePart
 from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.task import Attempt, MemoryBudget
 from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.units import count_text, counted

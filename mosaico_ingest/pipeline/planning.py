@@ -10,9 +10,8 @@ from typing import Any
 
 from msgspec import Struct
 
-from mosaico_ingest.adapters.adapter import UnmodeledSpec, source_metadata
+from mosaico_ingest.adapters.adapter import IMAGE_TAG, UnmodeledSpec, source_metadata
 from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
-from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.destinations.base import destination_of

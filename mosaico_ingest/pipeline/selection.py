@@ -14,8 +14,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
-from mosaico_ingest.adapters.mapping.columns import pt
-from mosaico_ingest.adapters.mapping.types import format_type, is_list
+from mosaico_ingest.adapters.mapping.columns import format_type, is_list, pt
 from mosaico_ingest.contracts.rows import (
     Evaluator,
     FieldExpression,
@@ -26,7 +25,7 @@ from mosaico_ingest.contracts.rows import (
     message_rows,
 )
 from mosaico_ingest.contracts.values import Values
-from mosaico_ingest.decode.base import Decoder
+from mosaico_ingest.decode.decoder import Decoder
 from mosaico_ingest.errors import BagError, ManifestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job

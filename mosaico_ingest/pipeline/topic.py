@@ -13,14 +13,13 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
-from mosaico_ingest.decode.base import Decoder
-from mosaico_ingest.decode.decoder import decoder_for
+from mosaico_ingest.decode.decoder import Decoder, decoder_for
 from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.lazy import cache_by_identity
-from mosaico_ingest.ontology.types import OntologyType, RequiredFields
+from mosaico_ingest.ontology.registry import OntologyType, RequiredFields
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.rejections import Quarantine
 from mosaico_ingest.pipeline.selection import Conditions, RowSelector, bind_conditions, block_times, row_times

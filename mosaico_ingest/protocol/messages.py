@@ -17,7 +17,7 @@ from pydantic import (
     model_serializer,
 )
 
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 
 DEFAULT_LIMIT_BYTES = 50_000_000
 """The message limit of a server that does not announce one, in bytes."""

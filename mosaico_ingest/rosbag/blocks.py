@@ -22,7 +22,7 @@ from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 
 if TYPE_CHECKING:
-    from mosaico_ingest.ontology.header import Time
+    from mosaico_ingest.ontology.model import Time
 
 EARLIEST_NS, LATEST_NS = -(2**63), 2**63 - 1
 """The range of int64 nanosecond timestamps; the latest is in the year 2262."""
@@ -296,7 +296,7 @@ class ROSHeader(Struct, frozen=True):
     @property
     def stamp(self) -> Time:
         """`stamp` as a time of the ontology."""
-        from mosaico_ingest.ontology.header import Time  # noqa: PLC0415 - imports pydantic
+        from mosaico_ingest.ontology.model import Time  # noqa: PLC0415 - imports pydantic
 
         return Time.from_nanoseconds(self.stamp_ns)
 

@@ -18,7 +18,7 @@ from mosaico_ingest.destinations.store.session import StoreSession, StoreTopic
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve.errors import Refusal, refuse_invalid

@@ -18,12 +18,10 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, AdapterSpec, Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference, outputs_of
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
-from mosaico_ingest.adapters.draft import RecordedExample, draft
-from mosaico_ingest.adapters.explain import Description, describe, unread_fields
+from mosaico_ingest.adapters.draft import Description, RecordedExample, describe, draft, unread_fields
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.mapping.model import RecordedMessage, Scalar
-from mosaico_ingest.adapters.mapping.testing import CaseResult, run_tests
-from mosaico_ingest.adapters.standalone import DefinitionFinder, mapping_of
+from mosaico_ingest.adapters.standalone import CaseResult, DefinitionFinder, mapping_of, run_tests
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, NothingMatched
 from mosaico_ingest.findings import Finding

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.adapters.mapping.types import is_number
+from mosaico_ingest.adapters.mapping.columns import is_number
 from mosaico_ingest.contracts.clauses import duration_text, number_text
 from mosaico_ingest.contracts.monitor import TopicMonitor
 from mosaico_ingest.contracts.rows import Evaluator, FieldExpression, bind_expression, message_rows

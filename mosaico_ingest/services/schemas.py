@@ -15,16 +15,15 @@ from msgspec import Struct
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.builtin import BUILTIN, BY_NAME
-from mosaico_ingest.adapters.mapping.inline_ontology import PLAIN_TYPES
+from mosaico_ingest.adapters.mapping.columns import format_type, is_list
+from mosaico_ingest.adapters.mapping.loader import PLAIN_TYPES
 from mosaico_ingest.adapters.mapping.model import adapter_schema
-from mosaico_ingest.adapters.mapping.types import format_type, is_list
 from mosaico_ingest.documents import write_atomically
 from mosaico_ingest.errors import ContractError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.reference import job_schema
-from mosaico_ingest.ontology.registry import MODULES, model, ontology_type, tags
-from mosaico_ingest.ontology.units import column_unit
+from mosaico_ingest.ontology.registry import MODULES, column_unit, model, ontology_type, tags
 from mosaico_ingest.pipeline.compile import lock_path, read_lock_file
 from mosaico_ingest.pipeline.definition_changes import (
     LockDifference,

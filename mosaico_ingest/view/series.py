@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.findings import suggest_names
-from mosaico_ingest.ontology.units import column_unit
+from mosaico_ingest.ontology.registry import column_unit
 from mosaico_ingest.view.columns import Column, is_list, is_number, topic_columns
 from mosaico_ingest.view.rows import first_rows
 

@@ -16,7 +16,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.files import opened
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
-from mosaico_ingest.ontology.units import column_unit
+from mosaico_ingest.ontology.registry import column_unit
 from mosaico_ingest.report.timing import Timeline, TimelineReport, mean_rate_hz
 from mosaico_ingest.view.columns import Column, is_binary, is_list, is_number, topic_columns
 

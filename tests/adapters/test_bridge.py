@@ -22,7 +22,7 @@ from mosaico_ingest.adapters.python import PythonAdapterSpec, ROSAdapterBase, re
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.model import Serializable
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

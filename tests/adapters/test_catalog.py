@@ -28,8 +28,8 @@ from mosaico_ingest.adapters.builtin import (
 )
 from mosaico_ingest.adapters.builtin_files import catalog_file, read_catalog
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.adapters.mapping.testing import run_tests
 from mosaico_ingest.adapters.python import ROSAdapterBase
+from mosaico_ingest.adapters.standalone import run_tests
 from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.ontology.registry import ontology_type

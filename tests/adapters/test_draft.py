@@ -7,8 +7,7 @@ import pytest
 from mosaico_ingest.adapters.builtin import BUILTIN, find_builtin
 from mosaico_ingest.adapters.draft import draft
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.adapters.mapping.testing import run_tests
-from mosaico_ingest.adapters.standalone import DefinitionFinder
+from mosaico_ingest.adapters.standalone import DefinitionFinder, run_tests
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.registry import MODULES
 from mosaico_ingest.rosbag.definitions.linking import ros_shape

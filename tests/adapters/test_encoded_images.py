@@ -15,9 +15,8 @@ from made_recordings import record
 from PIL import Image
 
 from mosaico_ingest import api
-from mosaico_ingest.adapters.adapter import Adapted
+from mosaico_ingest.adapters.adapter import Adapted, EncodedImageSpec, without_files
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.image import EncodedImageSpec, without_files
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.fields import ImageFormat, ImageSettings

@@ -16,8 +16,7 @@ from made_recordings import define
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.builtin import BY_TYPE
-from mosaico_ingest.adapters.inverse import Restored, invert
-from mosaico_ingest.adapters.inverse.restore import differences
+from mosaico_ingest.adapters.inverse import Restored, differences, invert
 from mosaico_ingest.adapters.mapping.loader import load_adapter
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Embedded

@@ -17,7 +17,7 @@ from mosaico_ingest.adapters.adapter import (
     Envelope,
 )
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec, load_adapter
-from mosaico_ingest.adapters.mapping.testing import message_row, run_tests
+from mosaico_ingest.adapters.standalone import message_row, run_tests
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.rosbag.definitions.linking import ros_shape

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.adapters.mapping.testing import run_tests
+from mosaico_ingest.adapters.standalone import run_tests
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from mosaico_ingest.adapters.mapping.parser import (
+from mosaico_ingest.adapters.mapping.expressions import (
     Attribute,
     Call,
     EachElement,

@@ -16,12 +16,12 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.columns import ExprType
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
+from mosaico_ingest.adapters.mapping.expressions import parse
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
 from mosaico_ingest.adapters.mapping.functions.reference import with_reference
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
-from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.types import ExprType
 from mosaico_ingest.ontology.registry import ontology_type
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])

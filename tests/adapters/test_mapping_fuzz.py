@@ -14,13 +14,12 @@ from every_kind import every_kind
 import mosaico_ingest
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.columns import ExprType, TypeMismatch
 from mosaico_ingest.adapters.mapping.conversion import check_fits, convert
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
-from mosaico_ingest.adapters.mapping.expressions import TypedExpression
+from mosaico_ingest.adapters.mapping.expressions import ExpressionError, TypedExpression, parse
 from mosaico_ingest.adapters.mapping.functions import functions
 from mosaico_ingest.adapters.mapping.loader import load_adapter
-from mosaico_ingest.adapters.mapping.parser import ExpressionError, parse
-from mosaico_ingest.adapters.mapping.types import ExprType, TypeMismatch
 from mosaico_ingest.errors import AdapterError
 
 STAMP = pa.struct([("sec", pa.int32()), ("nanosec", pa.uint32())])

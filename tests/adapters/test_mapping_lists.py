@@ -15,10 +15,10 @@ from hypothesis import strategies as st
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.adapters.builtin import find_builtin
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.columns import ExprType
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
+from mosaico_ingest.adapters.mapping.expressions import parse
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter, load_adapter
-from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.types import ExprType
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded

@@ -14,10 +14,10 @@ import yaml
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.columns import ExprType
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation
+from mosaico_ingest.adapters.mapping.expressions import parse
 from mosaico_ingest.adapters.mapping.functions import functions
-from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.types import ExprType
 
 SECTION = (
     (Path(__file__).parents[2] / "docs" / "mapping.md").read_text("utf-8").split("### Nulls in lists")[1]

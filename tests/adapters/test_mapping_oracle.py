@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.mapping.checker import Checker, Scope
+from mosaico_ingest.adapters.mapping.columns import ExprType
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import (
     Cast,
@@ -30,9 +31,8 @@ from mosaico_ingest.adapters.mapping.expressions import (
     MessageRef,
     OpenList,
     TypedExpression,
+    parse,
 )
-from mosaico_ingest.adapters.mapping.parser import parse
-from mosaico_ingest.adapters.mapping.types import ExprType
 
 MESSAGE = every_kind()
 

@@ -11,7 +11,7 @@ import pytest
 from mosaico_ingest import api
 from mosaico_ingest.adapters import bridge
 from mosaico_ingest.adapters.bridge import ROSBridge, installed_adapters, load_adapter_reference
-from mosaico_ingest.adapters.permission import NO_PYTHON
+from mosaico_ingest.adapters.python import NO_PYTHON
 from mosaico_ingest.cli import app
 from mosaico_ingest.errors import AdapterError, ManifestError
 from mosaico_ingest.lint.engine import lint_paths

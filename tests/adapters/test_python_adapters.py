@@ -25,8 +25,7 @@ from mosaico_ingest.adapters.python import (
     registered_adapters,
 )
 from mosaico_ingest.errors import AdapterError
-from mosaico_ingest.ontology.header import Message
-from mosaico_ingest.ontology.model import Serializable
+from mosaico_ingest.ontology.model import Message, Serializable
 from mosaico_ingest.rosbag.blocks import ROSMessage
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from mosaico_ingest.adapters.adapter import Adapted, UnmodeledSpec, ros_metadata
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopi
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import as_path
 
 POINT = OntologyType("Point", pa.struct([pa.field("x", pa.float64())]))

@@ -18,7 +18,7 @@ from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists, ServerTarget
-from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.serve import serve
 

@@ -11,12 +11,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.decode import lockstep
+from mosaico_ingest.decode import locate as lockstep
 from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.lockstep import locate, locate_lockstep
-from mosaico_ingest.decode.spans import LocatedMessages, Payloads, StepOffsets
-from mosaico_ingest.decode.walk import locate_one_by_one
+from mosaico_ingest.decode.layout import LocatedMessages, Payloads, StepOffsets, compile_layout
+from mosaico_ingest.decode.locate import locate, locate_lockstep, locate_one_by_one
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

@@ -14,7 +14,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from mosaico_ingest.decode.base import Decoded, DictDecoder
+from mosaico_ingest.decode.decoder import Decoded, DictDecoder
 from mosaico_ingest.decode.json import JsonDecoder
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import MessageBlock

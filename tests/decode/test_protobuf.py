@@ -18,7 +18,7 @@ from protobuf_schemas import (
     proto3_file,
 )
 
-from mosaico_ingest.decode.base import Decoded, DictDecoder
+from mosaico_ingest.decode.decoder import Decoded, DictDecoder
 from mosaico_ingest.decode.protobuf import ProtobufDecoder
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.rosbag.blocks import MessageBlock

@@ -5,13 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.decode import spans as gather
-from mosaico_ingest.decode.spans import (
-    Cells,
-    bytes_at,
-    copy_slices,
-    fixed_cells,
-)
+from mosaico_ingest.decode import layout as gather
+from mosaico_ingest.decode.layout import Cells, bytes_at, copy_slices, fixed_cells
 
 DATA = np.random.default_rng(1).integers(0, 256, 60_000).astype(np.uint8)
 

@@ -9,11 +9,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.decode import lockstep
+from mosaico_ingest.decode import locate as lockstep
 from mosaico_ingest.decode.decoder import Decoded
-from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.lockstep import locate_lockstep
-from mosaico_ingest.decode.spans import Payloads
+from mosaico_ingest.decode.layout import Payloads, compile_layout
+from mosaico_ingest.decode.locate import locate_lockstep
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

@@ -13,8 +13,7 @@ import pytest
 from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
-from mosaico_ingest.decode.base import Decoder, DictDecoder
-from mosaico_ingest.decode.decoder import Decoded, RowwiseDecoder, decoder_for
+from mosaico_ingest.decode.decoder import Decoded, Decoder, DictDecoder, RowwiseDecoder, decoder_for
 from mosaico_ingest.errors import DecodeError, IngestError
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock

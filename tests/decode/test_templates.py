@@ -4,9 +4,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from mosaico_ingest.decode.layout import compile_layout
-from mosaico_ingest.decode.spans import LocatedMessages, Payloads
-from mosaico_ingest.decode.walk import locate_by_template
+from mosaico_ingest.decode.layout import LocatedMessages, Payloads, compile_layout
+from mosaico_ingest.decode.locate import locate_by_template
 from mosaico_ingest.rosbag.blocks import Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import (
     Container,

@@ -17,14 +17,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, Envelope
+from mosaico_ingest.adapters.adapter import Adapted, AdapterSpec, EncodedImageSpec, Envelope
 from mosaico_ingest.adapters.builtin import (
     BUILTIN,
     BY_NAME,
     BY_TYPE,
     Builtin,
 )
-from mosaico_ingest.adapters.image import EncodedImageSpec
 from mosaico_ingest.adapters.python import ontology_of
 from mosaico_ingest.errors import BagError
 from mosaico_ingest.job.fields import ImageSettings

@@ -23,7 +23,7 @@ from mosaico_ingest.export.loader import MosaicoToROSLoader
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.serve import Keyring, Server, serve
 

@@ -17,7 +17,7 @@ import pytest
 from mosaico_ingest.api import RosbagInjector
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.ontology.types import fingerprint
+from mosaico_ingest.ontology.registry import fingerprint
 from mosaico_ingest.serve.server import Service
 
 pytestmark = pytest.mark.interop

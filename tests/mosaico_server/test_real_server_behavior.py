@@ -20,8 +20,7 @@ from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
-from mosaico_ingest.ontology.registry import MODULES, ontology_type
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import MODULES, OntologyType, ontology_type
 
 BLOB = OntologyType("Blob", pa.struct([pa.field("data", pa.binary())]))
 NESTED = OntologyType("Nested", pa.struct([pa.field("a", pa.list_(pa.list_(pa.list_(pa.int8()))))]))

@@ -23,7 +23,7 @@ from mosaico_ingest.destinations.server.session import ServerSession
 from mosaico_ingest.errors import Interrupted, SequenceExists, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget, SessionLevelErrorPolicy
 from mosaico_ingest.ontology import Integer64
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 NUMBER = Integer64.ontology_type()
 BLOB = OntologyType("Blob", pa.struct([pa.field("data", pa.binary(), nullable=False)]))

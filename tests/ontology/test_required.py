@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.ontology.types import RequiredFields
+from mosaico_ingest.ontology.registry import RequiredFields
 
 STAMP = pa.struct(
     [pa.field("sec", pa.int32(), nullable=False), pa.field("frame", pa.string(), nullable=False)]

@@ -283,7 +283,7 @@ def test_model_lookup_imports_only_its_modules() -> None:
     code = (
         "import sys, mosaico_ingest.ontology as o; assert 'pydantic' not in sys.modules;"
         "o.Joy; names = {n for n in sys.modules if n.startswith('mosaico_ingest.ontology.')};"
-        "assert 'mosaico_ingest.ontology.sensors' in names and 'mosaico_ingest.ontology.ranging' not in names"
+        "assert 'mosaico_ingest.ontology.sensors' in names and 'mosaico_ingest.ontology.perception' not in names"
     )
     subprocess.run([sys.executable, "-c", code], check=True)  # noqa: S603 - our own words
 

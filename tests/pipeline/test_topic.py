@@ -15,7 +15,7 @@ from mosaico_ingest.adapters.adapter import Adapted, Envelope
 from mosaico_ingest.errors import AdapterError, DecodeError, SinkError
 from mosaico_ingest.findings import RowFailure
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer

@@ -26,7 +26,7 @@ from mosaico_ingest.errors import (
     Unreachable,
 )
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.serve import serve
 

@@ -14,7 +14,7 @@ from object_store import ObjectStore
 from mosaico_ingest.destinations.store import SequenceSummary, Store, StoreSink, object_catalog
 from mosaico_ingest.destinations.store import documents as snapshot
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import RemotePath, as_path
 
 pytestmark = pytest.mark.slow

@@ -27,7 +27,7 @@ from mosaico_ingest.destinations.store.compaction import compact
 from mosaico_ingest.destinations.store.store import Window, scan, verify
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import Compression, IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]
 RUN = CliRunner()

@@ -21,7 +21,7 @@ from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.model import DestinationSettings
 from mosaico_ingest.job.values import Compression, StoreTarget
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 ROWS = 20_000
 

@@ -13,7 +13,7 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.job.values import StoreTarget
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]
 

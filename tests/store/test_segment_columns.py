@@ -13,7 +13,7 @@ import pytest
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.segment import Columns, SegmentWriter
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 ROWS = 400
 BLOB = pa.struct([pa.field("data", pa.binary())])

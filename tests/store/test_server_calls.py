@@ -19,7 +19,7 @@ from flight_calls import Client, descriptor_of, refused
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve import Server, serve
 

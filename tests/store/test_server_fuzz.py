@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol.errors import Condition, condition_of
 from mosaico_ingest.protocol.messages import ACTIONS
 from mosaico_ingest.serve import serve

@@ -10,8 +10,7 @@ from hollow_batches import hollow_batch, malformed_batch
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.store import verify
-from mosaico_ingest.ontology.registry import MODULES, ontology_type
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import MODULES, OntologyType, ontology_type
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.serve import Server
 

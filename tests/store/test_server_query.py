@@ -15,7 +15,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Query
 from mosaico_ingest.serve import Server

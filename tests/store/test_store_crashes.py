@@ -19,7 +19,7 @@ from mosaico_ingest.destinations.store import files as layout
 from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 WRITER = Path(__file__).with_name("writer_process.py")
 Rows = Callable[..., pa.RecordBatch]

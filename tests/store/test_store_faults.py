@@ -26,7 +26,7 @@ from mosaico_ingest.destinations.store.catalog import FORMAT, Catalog
 from mosaico_ingest.destinations.store.files import Lease, is_live, translate_errors
 from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import SinkError, SinkUnavailable
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]
 

@@ -16,7 +16,7 @@ from object_store import ObjectStore
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import SequenceSummary, Store, StoreSink
 from mosaico_ingest.destinations.store.model import SequenceFilter
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]
 METADATA: dict[str, dict[str, Any]] = {

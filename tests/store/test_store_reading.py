@@ -17,7 +17,7 @@ from mosaico_ingest.destinations.store.session import Staging, StoreTopic
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 Rows = Callable[..., pa.RecordBatch]
 

@@ -13,8 +13,7 @@ from store_formats import make_format_1
 
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.catalog import FORMAT
-from mosaico_ingest.ontology.registry import ontology_type
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType, ontology_type
 
 Rows = Callable[..., pa.RecordBatch]
 

@@ -11,7 +11,7 @@ import pyarrow as pa
 from mosaico_ingest import api
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 NASTY = "</script><script>document.title = 'broken'</script>\x1b[2J\u202e&amp; \"'"

@@ -12,7 +12,7 @@ import pytest
 from mosaico_ingest import api
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink, TopicInfo
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.view import rows as view_rows
 from mosaico_ingest.view.rows import first_rows, last_rows, nearest_row, rows_near, sampled_rows
 

@@ -15,7 +15,7 @@ from PIL import Image
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.view.chart import chart_lines, write_chart
 from mosaico_ingest.view.series import Series, _Envelope, plot_fields, read_series
 

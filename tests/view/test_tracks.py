@@ -10,8 +10,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.ontology.registry import builtin_type
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType, builtin_type
 from mosaico_ingest.view.tracks import has_track, local_meters, read_track
 
 FIX = OntologyType(

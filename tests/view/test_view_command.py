@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 import mosaico_ingest
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.view.rerun_recording import ViewedTopic, send_sequence, spaces
 
 

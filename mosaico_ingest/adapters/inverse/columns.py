@@ -18,14 +18,6 @@ from mosaico_ingest.adapters.inverse.message_builder import (
     MessageBuilder,
     pack_clouds,
 )
-from mosaico_ingest.adapters.mapping.column_plan import (
-    ColumnPlan,
-    ExpressionSource,
-    MapLookup,
-    NestedAdapter,
-    NullColumn,
-    StructSource,
-)
 from mosaico_ingest.adapters.mapping.columns import (
     SECOND_NS,
     Array,
@@ -33,12 +25,21 @@ from mosaico_ingest.adapters.mapping.columns import (
     Mask,
     arrays,
     field_of,
+    is_number,
     null_mask,
     open_list,
     pc,
     pt,
     time_ns,
     true_mask,
+)
+from mosaico_ingest.adapters.mapping.evaluator import (
+    ColumnPlan,
+    ExpressionSource,
+    MapLookup,
+    NestedAdapter,
+    NullColumn,
+    StructSource,
 )
 from mosaico_ingest.adapters.mapping.expressions import (
     Cast,
@@ -48,6 +49,7 @@ from mosaico_ingest.adapters.mapping.expressions import (
     EnvelopeField,
     FieldAccess,
     FunctionCall,
+    LiteralValue,
     MakeList,
     MessageRef,
     OpenList,
@@ -55,8 +57,6 @@ from mosaico_ingest.adapters.mapping.expressions import (
 )
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
 from mosaico_ingest.adapters.mapping.loader import MappingAdapter
-from mosaico_ingest.adapters.mapping.parser import LiteralValue
-from mosaico_ingest.adapters.mapping.types import is_number
 
 
 def _same(values: Array) -> Array:

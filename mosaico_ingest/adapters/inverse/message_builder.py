@@ -17,6 +17,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     arrays,
     field_of,
     fixed_list,
+    is_list,
     null_mask,
     open_list,
     pc,
@@ -24,8 +25,7 @@ from mosaico_ingest.adapters.mapping.columns import (
     struct_of,
     variable_list,
 )
-from mosaico_ingest.adapters.mapping.reads import ReadPath
-from mosaico_ingest.adapters.mapping.types import is_list
+from mosaico_ingest.adapters.mapping.loader import ReadPath
 
 CLOUD_FUNCTIONS: Mapping[str, tuple[str, int]] = {
     "points_float32": ("<f4", 7),

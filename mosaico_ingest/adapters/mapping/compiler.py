@@ -10,9 +10,28 @@ from msgspec import Struct
 from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapter, AdapterSpec
-from mosaico_ingest.adapters.mapping.analyzer import Analyzer, Target, is_short_cast
-from mosaico_ingest.adapters.mapping.checker import Binding, Scope, typed_constant
-from mosaico_ingest.adapters.mapping.column_plan import (
+from mosaico_ingest.adapters.mapping.checker import (
+    Analyzer,
+    Binding,
+    Scope,
+    Target,
+    is_short_cast,
+    typed_constant,
+)
+from mosaico_ingest.adapters.mapping.columns import (
+    DataType,
+    ExprType,
+    TypeMismatch,
+    arrays,
+    common_type,
+    expr_type_of,
+    format_type,
+    is_list,
+    pt,
+    within,
+)
+from mosaico_ingest.adapters.mapping.conversion import check_fits
+from mosaico_ingest.adapters.mapping.evaluator import (
     ColumnPlan,
     ColumnSource,
     ExpressionSource,
@@ -21,8 +40,6 @@ from mosaico_ingest.adapters.mapping.column_plan import (
     NullColumn,
     StructSource,
 )
-from mosaico_ingest.adapters.mapping.columns import DataType, arrays, pt
-from mosaico_ingest.adapters.mapping.conversion import check_fits
 from mosaico_ingest.adapters.mapping.expressions import (
     AnalyzedExpression,
     Constant,
@@ -31,17 +48,8 @@ from mosaico_ingest.adapters.mapping.expressions import (
 )
 from mosaico_ingest.adapters.mapping.functions.registry import suggest
 from mosaico_ingest.adapters.mapping.model import MappingFile, RecordModel, Scalar, Value, ValueForm
-from mosaico_ingest.adapters.mapping.types import (
-    ExprType,
-    TypeMismatch,
-    common_type,
-    expr_type_of,
-    format_type,
-    is_list,
-    within,
-)
 from mosaico_ingest.errors import AdapterError, SinkError
-from mosaico_ingest.ontology.types import NullRows, OntologyType
+from mosaico_ingest.ontology.registry import NullRows, OntologyType
 from mosaico_ingest.protocol import check_metadata
 from mosaico_ingest.rosbag.definitions.model import Definition
 

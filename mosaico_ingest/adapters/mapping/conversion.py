@@ -12,29 +12,27 @@ from mosaico_ingest.adapters.mapping.columns import (
     Array,
     Axis,
     DataType,
+    ExprType,
     Mask,
+    TypeMismatch,
     arrays,
+    exact_float,
+    expr_type_of,
     fixed_list,
+    format_type,
+    int_bounds,
+    is_list,
+    is_number,
     null_mask,
     open_list,
     pc,
     pt,
     struct_of,
     variable_list,
+    within,
 )
 from mosaico_ingest.adapters.mapping.functions.registry import RejectRows, set_null
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE, as_header, as_stamp
-from mosaico_ingest.adapters.mapping.types import (
-    ExprType,
-    TypeMismatch,
-    exact_float,
-    expr_type_of,
-    format_type,
-    int_bounds,
-    is_list,
-    is_number,
-    within,
-)
 
 
 def element_type(target: DataType, axes: tuple[int | None, ...]) -> DataType:

@@ -1,9 +1,10 @@
-"""Load adapter files, and bind them to message definitions."""
+"""Load adapter files, bind them to message definitions, and list the message fields that they read."""
 
 from __future__ import annotations
 
 import keyword
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from contextvars import ContextVar
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -17,26 +18,62 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from mosaico_ingest.adapters.adapter import Adapted, Envelope
-from mosaico_ingest.adapters.mapping.analyzer import Analyzer
-from mosaico_ingest.adapters.mapping.checker import RESERVED_NAMES, Binding, Scope, typed_constant
-from mosaico_ingest.adapters.mapping.column_plan import ColumnPlan, evaluate_column
-from mosaico_ingest.adapters.mapping.columns import open_list
+from mosaico_ingest.adapters.mapping.checker import (
+    CAST_TYPES,
+    RESERVED_NAMES,
+    Analyzer,
+    Binding,
+    Scope,
+    typed_constant,
+)
+from mosaico_ingest.adapters.mapping.columns import DataType, ExprType, arrays, is_list, open_list, pt
 from mosaico_ingest.adapters.mapping.compiler import AdapterLookup, Compiler
-from mosaico_ingest.adapters.mapping.evaluator import Evaluation, Rejection, RowsRejected
-from mosaico_ingest.adapters.mapping.expressions import TypedExpression
+from mosaico_ingest.adapters.mapping.evaluator import (
+    ColumnPlan,
+    Evaluation,
+    ExpressionSource,
+    MapLookup,
+    NestedAdapter,
+    Rejection,
+    RowsRejected,
+    StructSource,
+    evaluate_column,
+)
+from mosaico_ingest.adapters.mapping.expressions import (
+    Cast,
+    CloseList,
+    Conditional,
+    Constant,
+    ElementAt,
+    EnvelopeField,
+    FieldAccess,
+    FunctionCall,
+    MakeList,
+    MessageRef,
+    OpenList,
+    OuterValue,
+    TypedExpression,
+)
 from mosaico_ingest.adapters.mapping.functions.registry import suggest
-from mosaico_ingest.adapters.mapping.inline_ontology import inline_ontology_type
-from mosaico_ingest.adapters.mapping.model import InlineType, MappingFile, RecordModel, Scalar, records_of
-from mosaico_ingest.adapters.mapping.types import ExprType
+from mosaico_ingest.adapters.mapping.model import (
+    FieldDeclaration,
+    FieldType,
+    InlineType,
+    MappingFile,
+    RecordModel,
+    Scalar,
+    records_of,
+)
 from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import Finding, RowFailure, Severity
-from mosaico_ingest.ontology.registry import UnknownTag, ontology_type
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import MODULES, OntologyType, UnknownTag, ontology_type
 from mosaico_ingest.rosbag.definitions.model import Definition, MessageType, normalize_msgtype
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source
+if TYPE_CHECKING:
+    from mosaico_ingest.job.yaml_source import KeyPath
 
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound with their message types, to detect adapters that use each other in a cycle."""
@@ -473,3 +510,175 @@ def _adapter_error(message: str, source: Source, findings: tuple[Finding, ...]) 
     text = f"{message}: {first.message}{more}" if first else message
     location = str(first.span) if first and first.span else source.file
     return AdapterError(text, where=location, hint=first.help if first else None, findings=findings)
+
+
+PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
+_LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
+_ENVELOPE_COLUMN = "timestamp_ns"
+_LIST_OF_STRUCTS = "list"
+
+
+def inline_ontology_type(inline: InlineType, analyzer: Analyzer, base: KeyPath = ()) -> OntologyType:
+    """Return the ontology type declared below the key path `base`; fields with a finding are omitted."""
+    path: KeyPath = (*base, "ontology", "fields")
+    if _ENVELOPE_COLUMN in inline.fields:
+        message = f"{_ENVELOPE_COLUMN} is the column of the log time"
+        analyzer.report((*path, _ENVELOPE_COLUMN), message, "rename the field")
+    if inline.tag in MODULES:
+        message = f"{inline.tag!r} is a built-in tag with its own columns"
+        hint = f"write ontology: {inline.tag}, or choose another tag"
+        analyzer.report_value((*base, "ontology", "tag"), message, hint)
+    return OntologyType(inline.tag, pa.struct(_fields(inline.fields, path, analyzer)), inline.format)
+
+
+def _fields(fields: Mapping[str, FieldType], path: KeyPath, analyzer: Analyzer) -> list[DataType]:
+    columns = (_field(name, field, (*path, name), analyzer) for name, field in fields.items())
+    return [column for column in columns if column is not None]
+
+
+def _field(name: str, field: FieldType, path: KeyPath, analyzer: Analyzer) -> DataType | None:
+    if not name.isidentifier():  # Queries and SQL separate nested fields with dots.
+        analyzer.report(path, f"{name!r} is not a valid field name", "use letters, digits and _")
+        return None
+    declaration = FieldDeclaration(type=field) if isinstance(field, str) else field
+    type_: DataType | None
+    if declaration.fields is not None and declaration.type in {None, _LIST_OF_STRUCTS}:
+        struct = pa.struct(_fields(declaration.fields, (*path, "fields"), analyzer))
+        type_ = struct if declaration.type is None else arrays.list_(struct)
+    elif declaration.type is None or declaration.fields is not None:
+        hint = "write {type: float64}, {fields: {…}}, or {type: list, fields: {…}}"
+        analyzer.report(path, f"the field {name!r} needs either type or fields", hint)
+        return None
+    else:
+        type_path = path if isinstance(field, str) else (*path, "type")
+        type_ = _type(declaration.type, type_path, analyzer)
+    return None if type_ is None else pa.field(name, type_, nullable=declaration.nullable)
+
+
+def _type(text: str, path: KeyPath, analyzer: Analyzer) -> DataType | None:
+    text = text.strip()
+    if text in PLAIN_TYPES:
+        return PLAIN_TYPES[text]
+    match = _LIST.fullmatch(text)
+    if match is not None:
+        element = _type(match["element"], path, analyzer)
+        if element is None:
+            return None
+        return arrays.list_(element, int(match["size"])) if match["size"] else arrays.list_(element)
+    try:
+        return ontology_type(text).struct
+    except UnknownTag as error:
+        nearest = suggest(text, PLAIN_TYPES) or error.hint
+        types = f"use {', '.join(PLAIN_TYPES)}, list[T], list[T, N] or an ontology tag"
+        hint = f"{nearest} {types}" if nearest and nearest.startswith("did you mean") else types
+        analyzer.report_value(path, f"{text!r} is neither a type nor an ontology tag", hint)
+        return None
+
+
+ReadPath: TypeAlias = "tuple[str, ...]"
+"""The names that lead to a field, without marks for lists: `joints`, `name` for `joints[].name`."""
+_Scopes: TypeAlias = "tuple[ReadPath, ...]"
+"""The paths of the messages around an expression, outermost first; names are looked up in the last one."""
+
+
+def unread_paths(shape: DataType, reads: set[ReadPath], at: ReadPath = ()) -> Iterator[ReadPath]:
+    """Yield the fields of a message that are not among the fields read; a struct of unread fields is one each."""
+    for each in shape:
+        path = (*at, each.name)
+        if any(path[:length] in reads for length in range(len(path) + 1)):
+            continue
+        element = each.type
+        while is_list(element):
+            element = element.value_type
+        if pt.is_struct(element) and any(path_read[: len(path)] == path for path_read in reads):
+            yield from unread_paths(element, reads, path)
+        else:
+            yield path
+
+
+def column_reads(adapter: MappingAdapter, at: ReadPath = ()) -> Iterator[ReadPath]:
+    """Yield the fields that the columns and the conditions of an adapter read, as paths from the message."""
+    for output in (adapter, *adapter.others):
+        yield from _of_field(output.record, (at,))
+        for typed in output.drops:
+            yield from _of_value(typed, (at,))
+
+
+def metadata_reads(adapter: MappingAdapter, at: ReadPath = ()) -> Iterator[ReadPath]:
+    """Yield the fields that the topic metadata contains."""
+    for output in (adapter, *adapter.others):
+        for typed in output.metadata.values():
+            yield from _of_value(typed, (at,))
+
+
+def _of_field(field: ColumnPlan, at: _Scopes) -> Iterator[ReadPath]:
+    """Yield the fields that a column reads, as paths from the message; `at` is the scope of its names."""
+    source = field.source
+    match source:
+        case ExpressionSource():
+            yield from _of_value(source.expression, at)
+        case MapLookup():
+            yield from _of_value(source.operand, at)
+            if source.otherwise is not None:
+                yield from _of_value(source.otherwise, at)
+        case NestedAdapter():
+            inner = source.adapter
+            path = _path_of(source.operand, at)
+            yield from column_reads(inner, path) if isinstance(inner, MappingAdapter) else (path,)
+        case StructSource():
+            inside = at if source.operand is None else (*at, _path_of(source.operand, at))
+            if source.operand is not None:
+                yield from _computed_inside(source.operand, at)
+            for column in source.fields:
+                yield from _of_field(column, inside)
+        case _:
+            pass
+    for column in field.overrides:
+        yield from _of_field(column, at)
+    if field.when is not None:
+        yield from _of_value(field.when, at)
+
+
+def _of_value(typed: TypedExpression, at: _Scopes) -> Iterator[ReadPath]:
+    match typed:
+        case Constant() | EnvelopeField():
+            return
+        case OuterValue():
+            yield from _of_value(typed.operand, at[: -typed.levels])
+            return
+        case FunctionCall(arguments=parts) | MakeList(items=parts):
+            pass
+        case Conditional():
+            parts = (typed.condition, typed.then, typed.otherwise)
+        case Cast():
+            parts = (typed.operand,)
+        case _:
+            yield _path_of(typed, at)
+            yield from _computed_inside(typed, at)
+            return
+    for part in parts:
+        yield from _of_value(part, at)
+
+
+def _computed_inside(typed: TypedExpression, at: _Scopes) -> Iterator[ReadPath]:
+    """Yield the fields below a computed list, as in `sort(a)[0]`."""
+    inner: Any = typed
+    while isinstance(inner, (FieldAccess, OpenList, CloseList, ElementAt)):
+        inner = inner.operand
+    if not isinstance(inner, MessageRef):
+        yield from _of_value(inner, at)
+
+
+def _path_of(typed: TypedExpression, at: _Scopes) -> ReadPath:
+    """Return the path of the field that an expression reads; computed values have the path of no field."""
+    match typed:
+        case FieldAccess():
+            return (*_path_of(typed.operand, at), typed.name)
+        case OpenList() | CloseList() | ElementAt():
+            return _path_of(typed.operand, at)
+        case MessageRef():
+            return at[-1]
+        case OuterValue():
+            return _path_of(typed.operand, at[: -typed.levels])
+        case _:
+            return ("",)  # no field has an empty name

@@ -11,7 +11,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Discriminator, Fiel
 from pydantic_core import PydanticCustomError
 
 from mosaico_ingest.documents import DIALECT, schema_of, tidy
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 
 
 def _plain(value: object) -> object:

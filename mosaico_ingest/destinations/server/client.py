@@ -26,7 +26,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.base import validated
 from mosaico_ingest.errors import IngestError, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import DEFAULT_PORT, ServerTarget
-from mosaico_ingest.ontology.types import SerializationFormat
+from mosaico_ingest.ontology.registry import SerializationFormat
 from mosaico_ingest.protocol import key_problem, messages
 from mosaico_ingest.protocol.errors import Condition, condition_of, text_of
 from mosaico_ingest.protocol.messages import (

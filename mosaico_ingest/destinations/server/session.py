@@ -42,7 +42,7 @@ from mosaico_ingest.destinations.server.client import (
 )
 from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists, ServerTarget
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, Permission, topic_locator

@@ -53,7 +53,7 @@ from mosaico_ingest.destinations.store.sqlite import (
 )
 from mosaico_ingest.errors import SequenceExists, SinkError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
 from mosaico_ingest.remote import AnyPath
 
 FORMAT = 2

@@ -42,7 +42,7 @@ from mosaico_ingest.destinations.store.model import (
 from mosaico_ingest.destinations.store.segment import Segment
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.values import IfExists
-from mosaico_ingest.ontology.types import OntologyType, SerializationFormat
+from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
 from mosaico_ingest.remote import RemotePath
 
 FORMAT = 1

@@ -18,7 +18,7 @@ from mosaico_ingest.documents import html_table
 from mosaico_ingest.errors import SinkError, missing_library
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import AnyPath
 from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 

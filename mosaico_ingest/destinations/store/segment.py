@@ -19,7 +19,7 @@ from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.job.values import Compression
 from mosaico_ingest.lazy import cache_by_identity
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import AnyPath
 
 _LEVEL, _SMALL_LEVEL = 1, 9

@@ -43,7 +43,7 @@ from mosaico_ingest.destinations.store.segment import (
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, Compression, IfExists
-from mosaico_ingest.ontology.types import OntologyType
+from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import AnyPath, RemotePath
 
 Group = Future[None]

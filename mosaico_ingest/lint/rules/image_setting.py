@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+from mosaico_ingest.adapters.adapter import IMAGE_TAG
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.image import IMAGE_TAG
 from mosaico_ingest.job.fields import image_settings, reference_of
 from mosaico_ingest.job.values import first_match, is_glob
 from mosaico_ingest.lint.check import Check, Job, Problem

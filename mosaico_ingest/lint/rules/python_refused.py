@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from mosaico_ingest.adapters.permission import is_python_allowed, python_refusal
+from mosaico_ingest.adapters.python import is_python_allowed, python_refusal
 from mosaico_ingest.lint.check import Check, Job, Problem, adapter_references, python_reference
 
 

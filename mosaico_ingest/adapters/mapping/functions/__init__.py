@@ -3,15 +3,7 @@
 Functions keep no state and must not depend on the adapter that calls them.
 """
 
-from mosaico_ingest.adapters.mapping.functions import (
-    lists,
-    numeric,
-    operators,
-    point_clouds,
-    ros,
-    selection,
-    text,
-)
+from mosaico_ingest.adapters.mapping.functions import lists, operators, ros, scalars
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BINARY,
@@ -47,5 +39,5 @@ __all__ = [
     "lookup",
 ]
 
-SUBJECTS = (operators, numeric, lists, selection, text, ros, point_clouds)
+SUBJECTS = (operators, scalars, lists, ros)
 """Where the functions come from, in the order of the documentation."""

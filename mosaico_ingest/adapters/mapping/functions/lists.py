@@ -1,16 +1,44 @@
-"""Functions over the elements of a list."""
+"""Functions of lists."""
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
-from mosaico_ingest.adapters.mapping.columns import Array, Axis, arrays, field_of, open_list, pc, pt
-from mosaico_ingest.adapters.mapping.functions.operators import float_result, integer_result
-from mosaico_ingest.adapters.mapping.functions.registry import Parameter, RejectRows, function, list_of
-from mosaico_ingest.adapters.mapping.types import INT64, ExprType, expr_type_of, int_bounds, is_number
+from mosaico_ingest.adapters.mapping.columns import (
+    INT64,
+    Array,
+    Axis,
+    ExprType,
+    Mask,
+    TypeMismatch,
+    arrays,
+    expr_type_of,
+    field_of,
+    format_type,
+    int_bounds,
+    is_list,
+    is_number,
+    open_list,
+    pc,
+    pt,
+    struct_of,
+    true_mask,
+    variable_list,
+)
+from mosaico_ingest.adapters.mapping.functions.operators import comparable, float_result, integer_result
+from mosaico_ingest.adapters.mapping.functions.registry import (
+    INTEGER,
+    LIST,
+    Parameter,
+    RejectRows,
+    function,
+    list_of,
+)
 
 NUMBERS = list_of("a list of numbers", is_number)
 BOOLEANS = list_of("a list of true and false", pt.is_boolean)
@@ -172,3 +200,237 @@ def any_(x: Array) -> Array:
 def all_(x: Array) -> Array:
     """Whether every element is true; null if an element is null."""
     return _logic(x, np.logical_and, empty=True)
+
+
+__all__: list[str] = []
+
+
+def _is_ordered(type_: Any) -> bool:  # noqa: ANN401 - an Arrow type
+    return is_number(type_) or pt.is_string(type_) or pt.is_boolean(type_)
+
+
+def _is_plain(type_: Any) -> bool:  # noqa: ANN401 - an Arrow type
+    return _is_ordered(type_) or pt.is_binary(type_)
+
+
+def _of_elements(parameter: Parameter) -> Parameter:
+    return replace(parameter, of_elements=True)
+
+
+_CONDITIONS = _of_elements(list_of("a condition on each element", pt.is_boolean))
+_SORT_KEYS = _of_elements(list_of("a number, text or boolean of each element", _is_ordered))
+_KEYS = _of_elements(list_of("a number, text or boolean of each element", _is_plain))
+_VALUES = _of_elements(LIST)
+_KEY = Parameter("a number, text or boolean", lambda expr_type: _is_plain(expr_type.arrow))
+
+
+def _element_type(x: ExprType, *_: ExprType) -> ExprType:
+    return expr_type_of(x.arrow.value_type, msgtype=x.msgtype)
+
+
+def _list_type(x: ExprType, *_: ExprType) -> ExprType:
+    return ExprType(arrays.list_(x.arrow.value_type), msgtype=x.msgtype)
+
+
+def _flat_type(x: ExprType) -> ExprType:
+    return _list_type(_element_type(x))
+
+
+def _selected(elements: Array, axis: Axis, keep: Mask) -> Array:
+    """Return lists of the elements to keep."""
+    if axis.null is not None:
+        keep = keep & ~axis.null[axis.parents]
+    counts = np.concatenate(([0], np.cumsum(keep)))
+    return variable_list(elements.filter(arrays.array(keep)), counts[axis.offsets], axis.null)
+
+
+def _at_positions(elements: Array, positions: NDArray[np.int64]) -> Array:
+    """Return one element per list; a negative position stands for null."""
+    return elements.take(arrays.array(np.maximum(positions, 0), mask=positions < 0))
+
+
+def _local(axis: Axis) -> NDArray[np.int64]:
+    """Return the index of each element in its list."""
+    return np.arange(axis.offsets[-1]) - axis.offsets[:-1][axis.parents]
+
+
+def _first(matches: Mask, axis: Axis) -> NDArray[np.int64]:
+    """Return the position of the first match in each list, or -1."""
+    positions = np.flatnonzero(matches)
+    rows, first = np.unique(axis.parents[positions], return_index=True)
+    result = np.full(len(axis.lengths), -1, np.int64)
+    result[rows] = positions[first]
+    return result
+
+
+@function(LIST, INTEGER, returns=_element_type)
+def element(x: Array, index: Array) -> Array:
+    """Element at an index, also written `x[index]`; negative indices count from the end; null if it does not exist."""
+    elements, axis = open_list(x)
+    index = pc.cast(index, arrays.int64(), safe=False)
+    values = np.asarray(pc.fill_null(index, 0))
+    positions = np.where(values < 0, values + axis.lengths, values)
+    absent = (positions < 0) | (positions >= axis.lengths) | np.asarray(index.is_null())
+    if axis.null is not None:
+        absent |= axis.null
+    return _at_positions(elements, np.where(absent, -1, positions + axis.offsets[:-1]))
+
+
+@function(LIST, INTEGER, INTEGER, returns=_list_type, optional=1)
+def slice_(x: Array, start: Array, stop: Array | None = None) -> Array:
+    """Elements from start to before stop, also written `x[start:stop]`; negative indices count from the end."""
+    elements, axis = open_list(x)
+    bounds: list[NDArray[np.int64]] = []
+    absent = np.zeros(len(x), bool) if axis.null is None else axis.null.copy()
+    for bound in (start, stop):
+        if bound is None:
+            bounds.append(axis.lengths)
+            continue
+        absent |= np.asarray(bound.is_null())
+        values = np.asarray(pc.fill_null(pc.cast(bound, arrays.int64(), safe=False), 0))
+        bounds.append(np.where(values < 0, values + axis.lengths, values))
+    local, parents = _local(axis), axis.parents
+    keep = (local >= bounds[0][parents]) & (local < bounds[1][parents])
+    return _selected(elements, Axis(axis.offsets, absent, axis.size), keep)
+
+
+@function(LIST, _CONDITIONS, returns=_list_type, name="filter")
+def filter_(x: Array, condition: Array) -> Array:
+    """Elements for which a condition is true, as in `filter(cells, voltage > 3)`; null counts as false."""
+    elements, axis = open_list(x)
+    conditions, _ = open_list(condition)
+    return _selected(elements, axis, true_mask(conditions))
+
+
+def _looked_up(_: ExprType, key_field: ExprType, key: ExprType, value_field: ExprType) -> ExprType:
+    own = key_field.arrow.value_type
+    if own != key.arrow and not (is_number(own) and is_number(key.arrow)):
+        raise TypeMismatch(f"the key is {format_type(key)}, the elements have {format_type(own)}", argument=2)
+    return _element_type(value_field)
+
+
+@function(
+    LIST,
+    _KEYS,
+    _KEY,
+    _VALUES,
+    returns=_looked_up,
+)
+def lookup(x: Array, key_field: Array, key: Array, value_field: Array) -> Array:
+    """Value of the first element with a key, as in `lookup(values, key, 'voltage', value)`; null without such an element."""
+    axis = open_list(x)[1]
+    keys, elements = open_list(key_field)[0], open_list(value_field)[0]
+    matches = true_mask(pc.equal(*comparable(keys, key.take(arrays.array(axis.parents)))))
+    if axis.null is not None:
+        matches &= ~axis.null[axis.parents]
+    return _at_positions(elements, _first(matches, axis))
+
+
+def _sortable(x: ExprType, keys: ExprType | None = None) -> ExprType:
+    if keys is None and not _is_ordered(x.arrow.value_type):
+        message = f"the elements are {format_type(_element_type(x))}"
+        raise TypeMismatch(message, argument=0, hint="sort them by a field: sort(list, field)")
+    return _list_type(x)
+
+
+@function(LIST, _SORT_KEYS, returns=_sortable, optional=1)
+def sort(x: Array, key: Array | None = None) -> Array:
+    """Elements in ascending order, or in that of a key, as in `sort(cells, -voltage)`; NaN, then null, come last."""
+    elements, axis = open_list(x)
+    keys = elements if key is None else open_list(key)[0]
+    table = arrays.table({"row": axis.parents, "key": keys})
+    order = pc.sort_indices(table, sort_keys=[("row", "ascending"), ("key", "ascending")])
+    return _selected(elements.take(order), axis, np.ones(len(elements), bool))
+
+
+@function(LIST, returns=_list_type)
+def reverse(x: Array) -> Array:
+    """Elements in the opposite order."""
+    elements, axis = open_list(x)
+    order = (axis.offsets[:-1] + axis.offsets[1:] - 1)[axis.parents] - np.arange(len(elements))
+    return _selected(elements.take(arrays.array(order)), axis, np.ones(len(elements), bool))
+
+
+@function(list_of("a list of numbers, texts, booleans or bytes", _is_plain), returns=_list_type)
+def unique(x: Array) -> Array:
+    """Elements without repetitions, in the order of their first occurrence; null equals null, and NaN equals NaN."""
+    elements, axis = open_list(x)
+    values = pc.add(elements, arrays.scalar(0, elements.type)) if pt.is_floating(elements.type) else elements
+    codes = np.asarray(pc.dictionary_encode(values, null_encoding="encode").indices)
+    pairs = axis.parents * (codes.max(initial=0) + 1) + codes
+    keep = np.zeros(len(elements), bool)
+    keep[np.unique(pairs, return_index=True)[1]] = True
+    return _selected(elements, axis, keep)
+
+
+@function(list_of("a list of lists", is_list), returns=_flat_type)
+def flatten(x: Array) -> Array:
+    """Elements of the lists in a list; a list that is null has no elements."""
+    lists, outer = open_list(x)
+    elements, inner = open_list(lists)
+    keep = np.ones(len(elements), bool)
+    if inner.null is not None:
+        keep = ~inner.null[inner.parents]
+    return _selected(elements, Axis(inner.offsets[outer.offsets], outer.null, None), keep)
+
+
+def _zipped_type(*lists: ExprType, names: tuple[str, ...]) -> ExprType:
+    fields = [arrays.field(name, x.arrow.value_type) for name, x in zip(names, lists, strict=True)]
+    return ExprType(arrays.list_(arrays.struct(fields)))
+
+
+@function(LIST, LIST, returns=_zipped_type, name="zip", variadic=True, named=True)
+def zip_(refuse: RejectRows, x: Array, y: Array, *others: Array, names: tuple[str, ...]) -> Array:
+    """List of messages with one field per list, named like the list, as in `zip(name, position)[].name`; rejects rows whose lists differ in length."""
+    opened = [open_list(values) for values in (x, y, *others)]
+    null = np.zeros(len(x), bool)
+    for _, axis in opened:
+        null |= False if axis.null is None else axis.null
+    first = opened[0][1]
+    for _, axis in opened[1:]:
+        differs = (axis.lengths != first.lengths) & ~null
+        if differs.any():
+            refuse(differs, "list-length", partial(_length_problem, first.lengths, axis.lengths))
+            null |= differs
+    lists = [
+        open_list(_selected(elements, Axis(axis.offsets, null, None), ~null[axis.parents]))
+        for elements, axis in opened
+    ]
+    columns = [elements for elements, _ in lists]
+    type_ = arrays.struct(
+        [arrays.field(name, values.type) for name, values in zip(names, columns, strict=True)]
+    )
+    rows = struct_of(columns, type_, None, len(columns[0]))
+    return variable_list(rows, lists[0][1].offsets, null if null.any() else None)
+
+
+def _length_problem(left: NDArray[np.int64], right: NDArray[np.int64], row: int) -> str:
+    return f"lists of {left[row]} and {right[row]} elements"
+
+
+def _index_type(_: ExprType) -> ExprType:
+    return integer_result(0, _MOST_ELEMENTS)
+
+
+def _position_of(x: Array, run: np.ufunc) -> Array:
+    elements, axis = open_list(x)
+    values = np.asarray(pc.fill_null(elements, 0))
+    extreme = fold(values, axis, run, 0)[axis.parents]
+    matches = values == extreme
+    if values.dtype.kind == "f":
+        matches |= np.isnan(values)
+    first = _first(matches, axis)
+    absent = absent_rows(elements, axis) | (first < 0)
+    return arrays.array(np.where(absent, 0, first - axis.offsets[:-1]), arrays.int64(), mask=absent)
+
+
+@function(NUMBERS, returns=_index_type)
+def argmin(x: Array) -> Array:
+    """Index of the first smallest element, the same as `least`; null for an empty list."""
+    return _position_of(x, np.minimum)
+
+
+@function(NUMBERS, returns=_index_type)
+def argmax(x: Array) -> Array:
+    """Index of the first largest element, the same as `greatest`; null for an empty list."""
+    return _position_of(x, np.maximum)

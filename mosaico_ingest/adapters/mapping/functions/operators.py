@@ -9,7 +9,21 @@ from typing import Any
 import numpy as np
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.mapping.columns import Array, Mask, arrays, null_mask, pc, pt, true_mask
+from mosaico_ingest.adapters.mapping.columns import (
+    INT64,
+    Array,
+    ExprType,
+    Mask,
+    TypeMismatch,
+    arrays,
+    format_type,
+    is_number,
+    null_mask,
+    pc,
+    pt,
+    true_mask,
+    widest_float,
+)
 from mosaico_ingest.adapters.mapping.functions.registry import (
     ANY,
     BOOLEAN,
@@ -20,14 +34,6 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     RejectRows,
     function,
     set_null,
-)
-from mosaico_ingest.adapters.mapping.types import (
-    INT64,
-    ExprType,
-    TypeMismatch,
-    format_type,
-    is_number,
-    widest_float,
 )
 
 _MOST_BITS = 64

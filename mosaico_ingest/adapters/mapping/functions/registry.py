@@ -12,14 +12,19 @@ import numpy as np
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.adapters.mapping.columns import Array, DataType, Mask, arrays, pc, pt
-from mosaico_ingest.adapters.mapping.types import (
+from mosaico_ingest.adapters.mapping.columns import (
+    Array,
+    DataType,
     ExprType,
+    Mask,
     TypeMismatch,
+    arrays,
     expr_type_of,
     format_type,
     is_list,
     is_number,
+    pc,
+    pt,
 )
 from mosaico_ingest.errors import AdapterError
 
