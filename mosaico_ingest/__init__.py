@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.rosbag.blocks import ROSMessage
     from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
     from mosaico_ingest.rosbag.loader import ROSLoader
-    from mosaico_ingest.view.alignment import align
+    from mosaico_ingest.view.rows import align
 
 __all__ = [
     "APIKeyPermissionEnum",
@@ -94,7 +94,7 @@ _MODULES = {
     "Store": "destinations.store",
     "Stores": "job.values",
     "TopicLevelErrorPolicy": "job.values",
-    "align": "view.alignment",
+    "align": "view.rows",
     "check": "api",
     "inspect": "api",
     "plan": "api",

@@ -157,7 +157,7 @@ def show(
     """Show a sequence's topics, or a topic's schema, counts, time span, metadata and first rows."""
     from mosaico_ingest.destinations.store import SequenceSummary, Store
     from mosaico_ingest.view.rows import first_rows as first
-    from mosaico_ingest.view.values import json_value
+    from mosaico_ingest.view.texts import json_value
 
     opened = Store.open(store, create=False)
     sequence, _, topic = path.lstrip("/").partition("/")
@@ -291,7 +291,7 @@ def print_attachments(attachments: Sequence[AttachmentInfo]) -> None:
 
 def print_topic(info: TopicInfo, first_rows: Sequence[Mapping[str, Any]]) -> None:
     """Print a topic's counts, time span, files, metadata, columns and first rows."""
-    from mosaico_ingest.view.values import value_text
+    from mosaico_ingest.view.texts import value_text
 
     print_line(f"{info.sequence}{info.name}", style="bold")
     facts = f"{info.ontology.tag}, {counted(info.rows, 'row')}, {bytes_text(info.stored_bytes)}"
@@ -326,7 +326,7 @@ def _leaf_columns(
 
 
 def _print_metadata(metadata: Mapping[str, Any]) -> None:
-    from mosaico_ingest.view.values import value_text
+    from mosaico_ingest.view.texts import value_text
 
     for name, value in _metadata_lines(metadata):
         print_line(f"  {name}: {value_text(value, METADATA_WIDTH)}")

@@ -55,8 +55,7 @@ def plot(
 ) -> None:
     """Plot fields of a topic over time, in the terminal or to a file. Every extreme value is kept."""
     from mosaico_ingest.errors import ViewError
-    from mosaico_ingest.view.chart import write_chart
-    from mosaico_ingest.view.series import plot_fields, read_series
+    from mosaico_ingest.view.series import plot_fields, read_series, write_chart
 
     topic = open_topic(store, path)
     names = fields or plot_fields(topic)
@@ -107,8 +106,7 @@ def image(
     store: StoreOption = DEFAULT_STORE,
 ) -> None:
     """Write the picture of a row: images in their colors, depth color-mapped, point clouds from above."""
-    from mosaico_ingest.view.images import write_picture
-    from mosaico_ingest.view.pictures import row_picture
+    from mosaico_ingest.view.pictures import row_picture, write_picture
     from mosaico_ingest.view.rows import nearest_row
 
     topic = open_topic(store, path)
@@ -129,8 +127,7 @@ def image(
 def _contact_sheet(topic: TopicInfo, count: int, size: int) -> tuple[Pixels, str]:
     """Return the contact sheet, and its description."""
     from mosaico_ingest.errors import ViewError
-    from mosaico_ingest.view.images import contact_sheet
-    from mosaico_ingest.view.pictures import thumbnails
+    from mosaico_ingest.view.pictures import contact_sheet, thumbnails
 
     side = min(size, 400)
     pictures = thumbnails(topic, count, width=side, height=side)
@@ -148,7 +145,7 @@ def _contact_sheet(topic: TopicInfo, count: int, size: int) -> tuple[Pixels, str
 
 
 def _row_facts(topic: TopicInfo, row: dict[str, object]) -> str:
-    from mosaico_ingest.view.values import instant_text
+    from mosaico_ingest.view.texts import instant_text
 
     time_ns = row[topic.schema.names[0]]
     kind = row.get("encoding") or topic.metadata.get("ros_format") or row.get("format") or topic.ontology.tag
@@ -157,7 +154,7 @@ def _row_facts(topic: TopicInfo, row: dict[str, object]) -> str:
 
 def _print_chart(series: list[Series], title: str) -> None:
     """Print a chart for each unit, with a legend of smallest and largest values."""
-    from mosaico_ingest.view.chart import chart_lines
+    from mosaico_ingest.view.series import chart_lines
 
     console = Terminal()
     width = min(console.width, CHART_WIDTH)

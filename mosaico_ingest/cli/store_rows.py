@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
     from mosaico_ingest.destinations.store import SequenceInfo, Store, TopicInfo
-    from mosaico_ingest.view.statistics import TopicStatistics, TopicTiming
+    from mosaico_ingest.view.columns import TopicStatistics, TopicTiming
 
 RECORD_WIDTH = 90
 """Characters of a value where each column of a row has its own line."""
@@ -136,8 +136,8 @@ def describe(
     from msgspec import to_builtins
 
     from mosaico_ingest.cli.store import attachment_json, print_attachments
-    from mosaico_ingest.view.statistics import describe_topic, topic_timing
-    from mosaico_ingest.view.values import json_value
+    from mosaico_ingest.view.columns import describe_topic, topic_timing
+    from mosaico_ingest.view.texts import json_value
 
     opened = _opened(store)
     sequence, _, topic = path.lstrip("/").partition("/")
@@ -251,14 +251,14 @@ class _RowView:
 
 
 def _print_json(cells: Mapping[str, pa.Array[Any]], rows: int) -> None:
-    from mosaico_ingest.view.values import json_value
+    from mosaico_ingest.view.texts import json_value
 
     lists = {name: values.to_pylist() for name, values in cells.items()}
     print_json([json_value({name: lists[name][row] for name in lists}) for row in range(rows)])
 
 
 def _print_csv(cells: Mapping[str, pa.Array[Any]]) -> None:
-    from mosaico_ingest.view.values import flat_text
+    from mosaico_ingest.view.texts import flat_text
 
     writer = csv.writer(sys.stdout)
     writer.writerow(cells)
@@ -281,7 +281,7 @@ def _print_columns(cells: Mapping[str, pa.Array[Any]]) -> None:
 
 
 def _cell_texts(values: pa.Array[Any], *, is_time: bool) -> list[str]:
-    from mosaico_ingest.view.values import instant_text, scalar_text
+    from mosaico_ingest.view.texts import instant_text, scalar_text
 
     if is_time:
         return [instant_text(value) for value in values.to_pylist() if value is not None]
@@ -332,7 +332,7 @@ def _print_timings(info: SequenceInfo, timings: Sequence[tuple[TopicInfo, TopicT
 def _print_topic_statistics(described: TopicStatistics, *, every: bool) -> None:
     from msgspec.structs import astuple
 
-    from mosaico_ingest.view.values import column_texts
+    from mosaico_ingest.view.texts import column_texts
 
     timing = described.timing
     print_line(f"{described.sequence}{described.topic}", style="bold")

@@ -49,7 +49,7 @@ def sql(
     A topic such as /gps/fix is the table SEQUENCE."gps/fix" or SEQUENCE.gps_fix.
     """
     from mosaico_ingest.destinations.store import Store
-    from mosaico_ingest.view.images import require_suffix
+    from mosaico_ingest.view.pictures import require_suffix
     from mosaico_ingest.view.sql import run_query
 
     if out is not None:
@@ -94,7 +94,7 @@ def _identifier(name: str) -> str:
 
 
 def _print_table(reader: pa.RecordBatchReader, limit: int) -> None:
-    from mosaico_ingest.view.values import scalar_text
+    from mosaico_ingest.view.texts import scalar_text
 
     names = reader.schema.names
     rows, has_more = list[tuple[str, ...]](), False
@@ -122,7 +122,7 @@ def _is_number(kind: pa.DataType) -> bool:
 
 
 def _print_json(reader: pa.RecordBatchReader) -> None:
-    from mosaico_ingest.view.values import json_value
+    from mosaico_ingest.view.texts import json_value
 
     print_json([json_value(row) for batch in reader for row in batch.to_pylist()])
 
@@ -133,7 +133,7 @@ def _write(reader: pa.RecordBatchReader, path: Path, suffix: str) -> int:
 
     import pyarrow.parquet as pq
 
-    from mosaico_ingest.view.values import json_value
+    from mosaico_ingest.view.texts import json_value
 
     rows = 0
     if suffix == ".parquet":
@@ -155,7 +155,7 @@ def _write(reader: pa.RecordBatchReader, path: Path, suffix: str) -> int:
 
 
 def _write_csv(reader: pa.RecordBatchReader, file: Any) -> int:  # noqa: ANN401 - a text file
-    from mosaico_ingest.view.values import flat_text
+    from mosaico_ingest.view.texts import flat_text
 
     writer = csv.writer(file)
     writer.writerow(reader.schema.names)

@@ -6,7 +6,7 @@ import heapq
 import logging
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PurePath
@@ -25,20 +25,32 @@ from mosaico_ingest.adapters.mapping.loader import MappingAdapter, MappingSpec
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.containers import ROS_VERSIONS
 from mosaico_ingest.destinations.store import Store
+from mosaico_ingest.destinations.store.model import AttachmentInfo
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
-from mosaico_ingest.export.columns import as_type, comparable
-from mosaico_ingest.export.kept import write_kept
-from mosaico_ingest.export.sources import SourceSequence, SourceTopic, StoreSequence
-from mosaico_ingest.findings import suggest_names
-from mosaico_ingest.job.values import Stores, select
+from mosaico_ingest.export.sources import SourceSequence, SourceTopic, StoreSequence, as_type, comparable
+from mosaico_ingest.findings import join_names, suggest_names
+from mosaico_ingest.job.values import CUSTOM_DATA_KEY, RECORDS_KEY, Stores, select
 from mosaico_ingest.ontology.registry import OntologyType
+from mosaico_ingest.rosbag.blocks import Attachment
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Language, normalize_msgtype
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
 from mosaico_ingest.rosbag.encodings import MESSAGE_ENCODINGS, encoding_of
-from mosaico_ingest.rosbag.rosbags_library import RecordingWriter, check_new_recording, open_writer
+from mosaico_ingest.rosbag.rosbags_library import (
+    AttachmentWriter,
+    RecordingWriter,
+    check_new_recording,
+    open_writer,
+)
 
 _log = logging.getLogger(__name__)
+_TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
+_TIME_2 = re.compile(r"^builtin_interfaces/(?:Time|Duration)(?:\[[<=\d]*\])?\s", re.MULTILINE)
+_ROWS = 1000
+"""Number of messages that are restored together."""
+Message = tuple[int, bytes]
+"""Log time in nanoseconds, and payload."""
+_READ_BYTES = 1 << 20
 
 
 class _Record(BaseModel):
@@ -102,10 +114,6 @@ class ExportReport(_Record):
         return not self.omitted and all(topic.faithful for topic in self.topics)
 
 
-_TIME_1 = re.compile(r"^(?:time|duration)(?:\[\d*\])?\s", re.MULTILINE)
-_TIME_2 = re.compile(r"^builtin_interfaces/(?:Time|Duration)(?:\[[<=\d]*\])?\s", re.MULTILINE)
-
-
 class Origin(Struct, frozen=True):
     """The original messages of a topic: type, definition and source file."""
 
@@ -151,13 +159,6 @@ def version_of(origin: Origin, others: Sequence[Origin], possible: Collection[in
     if version is None:
         version = 1 if PurePath(origin.source_file).suffix == ".bag" else 2
     return version if version in possible or origin.version is not None else min(possible)
-
-
-_ROWS = 1000
-"""Number of messages that are restored together."""
-
-Message = tuple[int, bytes]
-"""Log time in nanoseconds, and payload."""
 
 
 @dataclass(slots=True)
@@ -497,3 +498,58 @@ def _messages(
     with closing(source.rows(restorer.info, start_ns, end_ns)) as batches:
         for log_ns, payload in restorer.read(batches):
             yield log_ns, connection, payload
+
+
+def write_kept(source: SourceSequence, writer: RecordingWriter) -> tuple[str, ...]:
+    """Write metadata records, `custom_data` and attachments; return one line for each kind that the file cannot contain.
+
+    Raises:
+        BagError: An attachment cannot be read.
+    """
+    omitted: list[str] = []
+    records = dict(_pairs(source.metadata, RECORDS_KEY))
+    custom_data = {str(key): str(value) for key, value in _entries(source.metadata.get(CUSTOM_DATA_KEY))}
+    if isinstance(writer, AttachmentWriter):
+        for name, entries in records.items():
+            writer.add_metadata(name, entries)
+        for attachment in source.attachments:
+            writer.add_attachment(_attachment(attachment), _chunks(attachment))
+    else:
+        if records:
+            omitted.append(f"metadata records: {join_names(records)}")
+        if source.attachments:
+            omitted.append(f"attachments: {join_names(each.name for each in source.attachments)}")
+    if custom_data:
+        try:
+            writer.set_custom_data(custom_data)
+        except BagError:
+            omitted.append(f"custom_data: {join_names(custom_data)}")
+    return tuple(omitted)
+
+
+def _pairs(metadata: Mapping[str, Any], key: str) -> Iterator[tuple[str, list[tuple[str, str]]]]:
+    """Yield the name and the entries of each metadata record; values in another form are ignored."""
+    records = metadata.get(key)
+    for record in records if isinstance(records, list) else ():
+        if isinstance(record, dict) and isinstance(record.get("name"), str):
+            yield record["name"], _entries(record.get("entries"))
+
+
+def _entries(value: object) -> list[tuple[str, str]]:
+    pairs = (entry for entry in (value if isinstance(value, list) else ()) if isinstance(entry, list))
+    return [(str(pair[0]), str(pair[1])) for pair in pairs if len(pair) == len(("key", "value"))]
+
+
+def _attachment(info: AttachmentInfo) -> Attachment:
+    return Attachment(
+        info.name, info.media_type, info.log_ns, info.create_ns, info.stored_bytes, has_crc=True
+    )
+
+
+def _chunks(info: AttachmentInfo) -> Iterator[bytes]:
+    try:
+        with info.path.open("rb") as file:
+            while chunk := file.read(_READ_BYTES):
+                yield bytes(chunk)
+    except OSError as error:
+        raise BagError(f"the attachment cannot be read: {error.strerror}", where=str(info.path)) from error

@@ -11,9 +11,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.images.files import jpeg_file
 from mosaico_ingest.report.units import time_text
-from mosaico_ingest.view.clouds import grid_step
-from mosaico_ingest.view.images import Pixels, has_images, png_bytes
-from mosaico_ingest.view.pictures import thumbnails
+from mosaico_ingest.view.pictures import Pixels, grid_step, has_images, png_bytes, thumbnails
 from mosaico_ingest.view.tracks import Track, local_meters
 
 IMAGES = 12

@@ -322,7 +322,7 @@ def _examples(report: Report) -> list[QuarantinedMessage]:
 def _decoded_values(quarantine: Path, selected: set[tuple[str, int]]) -> dict[tuple[str, int], str]:
     """Return the fields of messages by topic and log time; empty for a file that is too large or cannot be read."""
     from mosaico_ingest.rosbag.loader import ROSLoader  # noqa: PLC0415 - only pages with quarantined messages need Arrow
-    from mosaico_ingest.view.values import value_text  # noqa: PLC0415 - only pages with quarantined messages need Arrow
+    from mosaico_ingest.view.texts import value_text  # noqa: PLC0415 - only pages with quarantined messages need Arrow
 
     values: dict[tuple[str, int], str] = {}
     try:

@@ -25,14 +25,11 @@ from mosaico_ingest.report.units import (
     time_text,
 )
 from mosaico_ingest.version import __version__
-from mosaico_ingest.view.images import has_images
-from mosaico_ingest.view.logs import LogExcerpt, has_log, read_excerpt
-from mosaico_ingest.view.pictures import has_pictures
-from mosaico_ingest.view.statistics import TopicStatistics, describe_topic
+from mosaico_ingest.view.columns import TopicStatistics, describe_topic
+from mosaico_ingest.view.pictures import has_images, has_pictures
+from mosaico_ingest.view.texts import ColumnTexts, LogExcerpt, column_texts, has_log, read_excerpt
 from mosaico_ingest.view.tracks import Track as Positions
-from mosaico_ingest.view.tracks import has_track, read_track
-from mosaico_ingest.view.transforms import frame_trees, read_edges
-from mosaico_ingest.view.values import ColumnTexts, column_texts
+from mosaico_ingest.view.tracks import frame_trees, has_track, read_edges, read_track
 
 MAX_STRIPS = 24
 """Topics with pictures that a page shows."""

@@ -25,8 +25,11 @@ if TYPE_CHECKING:
         Stores,
         register_default_adapter,
     )
-    from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
-    from mosaico_ingest.export.loader import MosaicoToROSLoader
+    from mosaico_ingest.export.official_bridge import (
+        MosaicoToROSLoader,
+        ROSExtractorConfig,
+        ROSSequenceExtractor,
+    )
     from mosaico_ingest.ontology import BatteryState, FrameTransform, PointCloud2, PointField
     from mosaico_ingest.rosbag.blocks import ROSHeader
 
@@ -52,10 +55,10 @@ __all__ = [
 ]
 
 _MODULES = {
-    "MosaicoToROSLoader": "mosaico_ingest.export.loader",
-    "ROSExtractorConfig": "mosaico_ingest.export.extractor",
+    "MosaicoToROSLoader": "mosaico_ingest.export.official_bridge",
+    "ROSExtractorConfig": "mosaico_ingest.export.official_bridge",
     "ROSHeader": "mosaico_ingest.rosbag.blocks",
-    "ROSSequenceExtractor": "mosaico_ingest.export.extractor",
+    "ROSSequenceExtractor": "mosaico_ingest.export.official_bridge",
 }
 """The module of each name that the package `mosaico_ingest` does not export."""
 

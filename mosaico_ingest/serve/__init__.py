@@ -6,8 +6,7 @@ package must not depend on recordings or on the pipeline.
 
 from __future__ import annotations
 
-from mosaico_ingest.serve.guard import Limits, responds
-from mosaico_ingest.serve.keys import Keyring
+from mosaico_ingest.serve.guard import Keyring, Limits, responds
 from mosaico_ingest.serve.server import Server, Tls, serve
 
 __all__ = ["Keyring", "Limits", "Server", "Tls", "responds", "serve"]

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from datetime import datetime, timezone
-from typing import Any
+from typing import Any, TypeAlias
 
+import numpy as np
 from msgspec import Struct
+from numpy.typing import NDArray
 
 from mosaico_ingest import protocol
 from mosaico_ingest.destinations.store.files import NotInStore
@@ -16,15 +18,14 @@ from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
 from mosaico_ingest.protocol.messages import Action, Body
 from mosaico_ingest.serve import query
-from mosaico_ingest.serve.clusters import Range, clusterize, intersect
-from mosaico_ingest.serve.errors import Deadline, Refusal, refuse_invalid
-from mosaico_ingest.serve.flights import split_locator
-from mosaico_ingest.serve.keys import Keyring, StoredKey
-from mosaico_ingest.serve.uploads import Uploads
+from mosaico_ingest.serve.flights import Uploads, split_locator
+from mosaico_ingest.serve.guard import Deadline, Keyring, Refusal, StoredKey, refuse_invalid
 from mosaico_ingest.version import __version__
 
 _PROTOCOL_VERSION = messages.SemVer(major=0, minor=7, patch=0)
 _EMPTY = messages.Empty()
+Range: TypeAlias = tuple[int, int]
+"""The first and the last timestamp in nanoseconds, both inclusive."""
 
 
 class Backend(Struct, frozen=True):
@@ -267,3 +268,35 @@ HANDLERS: Mapping[Action[Any, Any], Callable[[Backend, Any], Body | Iterator[Bod
     messages.API_KEY_REVOKE: _key_revoke,
 }
 """The function of every supported action; streamed actions return an iterator."""
+
+
+def clusterize(times: NDArray[np.int64], gap_ns: int) -> list[Range]:
+    """Return the ranges of sorted timestamps that gaps longer than `gap_ns` separate; 0 returns one range."""
+    if not len(times):
+        return []
+    ends = np.flatnonzero(np.diff(times) > gap_ns) if gap_ns else np.array([], np.int64)
+    starts = times[np.append(0, ends + 1)]
+    return list(zip(starts.tolist(), times[np.append(ends, len(times) - 1)].tolist(), strict=True))
+
+
+def intersect(clusters: Sequence[Sequence[Range]], tolerance_ns: int) -> Iterator[Range]:
+    """Yield the ranges in which every topic has a cluster, as the platform's server computes them.
+
+    The walk compares one cluster per topic and then advances the topic whose cluster ends first. Clusters that do not
+    overlap but are at most `tolerance_ns` apart yield their distance, widened by half the tolerance on each side.
+    """
+    if not all(clusters):
+        return
+    positions = [0] * len(clusters)
+    before_ns, after_ns = tolerance_ns // 2, tolerance_ns - tolerance_ns // 2
+    while True:
+        current = [ranges[position] for ranges, position in zip(clusters, positions, strict=True)]
+        first_end, topic = min((end, topic) for topic, (_, end) in enumerate(current))
+        last_start = max(start for start, _ in current)
+        if last_start <= first_end:
+            yield last_start, first_end
+        elif last_start <= first_end + tolerance_ns:
+            yield last_start - before_ns, first_end + after_ns
+        positions[topic] += 1
+        if positions[topic] == len(clusters[topic]):
+            return

@@ -28,10 +28,23 @@ from mosaico_ingest.destinations.store.model import SegmentInfo, SequenceInfo, T
 from mosaico_ingest.destinations.store.store import Store
 from mosaico_ingest.protocol import messages
 from mosaico_ingest.protocol.errors import Condition
-from mosaico_ingest.serve.errors import Deadline, Refusal
+from mosaico_ingest.serve.guard import Deadline, Refusal
 
 MISSING: Final = object()
 """The value of a field that does not exist."""
+_FLOAT_LIMIT = 2**1023
+"""Integers whose absolute value is smaller can be converted to a finite float."""
+_GLOB_PARTS = re.compile(r"\[(?:!?\][^]]*|![^]]+|[^]!][^]]*)\]|.", re.DOTALL)
+"""A part of a glob: a character class in brackets, or one character."""
+_COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
+    "$eq": operator.eq,
+    "$neq": operator.ne,
+    "$lt": operator.lt,
+    "$leq": operator.le,
+    "$gt": operator.gt,
+    "$geq": operator.ge,
+}
+_WITH_RANGE = "include_timestamp_range"
 
 
 class Test(Protocol):
@@ -48,20 +61,6 @@ class Test(Protocol):
     def column(self, column: pc.Expression, kind: pa.DataType) -> pc.Expression:
         """Return the condition as an expression on a column of the type `kind`."""
         ...
-
-
-_FLOAT_LIMIT = 2**1023
-"""Integers whose absolute value is smaller can be converted to a finite float."""
-_GLOB_PARTS = re.compile(r"\[(?:!?\][^]]*|![^]]+|[^]!][^]]*)\]|.", re.DOTALL)
-"""A part of a glob: a character class in brackets, or one character."""
-_COMPARISONS: Mapping[str, Callable[[Any, Any], Any]] = {
-    "$eq": operator.eq,
-    "$neq": operator.ne,
-    "$lt": operator.lt,
-    "$leq": operator.le,
-    "$gt": operator.gt,
-    "$geq": operator.ge,
-}
 
 
 class Comparison(Struct, frozen=True):
@@ -288,8 +287,6 @@ def _comparable(value: object, bound: object) -> bool:
         return isinstance(value, str) and isinstance(bound, str)
     return isinstance(value, int | float)
 
-
-_WITH_RANGE = "include_timestamp_range"
 
 Tests = Sequence[tuple[str, Test]]
 """Pairs of a field and a test of its value."""

@@ -19,11 +19,20 @@ from mosaico_ingest.protocol.errors import Condition, as_flight_error
 from mosaico_ingest.protocol.messages import ACTIONS, JSON, Body, Permission
 from mosaico_ingest.remote import RemotePath, as_path
 from mosaico_ingest.serve.actions import HANDLERS, Backend
-from mosaico_ingest.serve.errors import Refusal, translate_errors
-from mosaico_ingest.serve.flights import Flights, question_of
-from mosaico_ingest.serve.guard import AuditLog, Call, Guard, Limits
-from mosaico_ingest.serve.keys import MIDDLEWARE, KeyCheck, Keyring, count_refused_schema, require
-from mosaico_ingest.serve.uploads import Uploads
+from mosaico_ingest.serve.flights import Flights, Uploads, question_of
+from mosaico_ingest.serve.guard import (
+    MIDDLEWARE,
+    AuditLog,
+    Call,
+    Guard,
+    KeyCheck,
+    Keyring,
+    Limits,
+    Refusal,
+    count_refused_schema,
+    require,
+    translate_errors,
+)
 
 PORT = 6726
 """The default port of Mosaico clients."""

@@ -14,13 +14,25 @@ from mosaico_ingest.destinations.store.model import SequenceInfo, TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.errors import ViewError, missing_library
 from mosaico_ingest.images import color_map
-from mosaico_ingest.view.clouds import grid_pixels, has_grid, has_points, row_points
-from mosaico_ingest.view.images import decode_image, has_images
-from mosaico_ingest.view.logs import has_log, log_lines
-from mosaico_ingest.view.pictures import row_codec
+from mosaico_ingest.view.pictures import (
+    decode_image,
+    grid_pixels,
+    has_grid,
+    has_images,
+    has_points,
+    row_codec,
+    row_points,
+)
 from mosaico_ingest.view.series import plot_fields, read_series
-from mosaico_ingest.view.tracks import has_track, read_track
-from mosaico_ingest.view.transforms import FrameNode, frame_trees, has_transforms, read_edges
+from mosaico_ingest.view.texts import has_log, log_lines
+from mosaico_ingest.view.tracks import (
+    FrameNode,
+    frame_trees,
+    has_track,
+    has_transforms,
+    read_edges,
+    read_track,
+)
 
 TIMELINE = "time"
 """Name of the timeline. The viewer adds a timeline `log_time` of its own, which has the times of this process."""

@@ -23,7 +23,7 @@ from mosaico_ingest.job.fields import ImageFormat, ImageSettings
 from mosaico_ingest.pipeline.run import make_plan, run_recording
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.rosbag.definitions.model import Definition
-from mosaico_ingest.view.images import decode_image
+from mosaico_ingest.view.pictures import decode_image
 
 Adapt = Callable[..., Adapted]
 Define = Callable[..., Definition]

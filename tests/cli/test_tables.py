@@ -21,7 +21,7 @@ from mosaico_ingest.report.files import RunReport
 from mosaico_ingest.report.model import Rejection, Report, TopicReport
 from mosaico_ingest.report.units import rate_text, written_text
 from mosaico_ingest.services.inspection import draft_manifest, estimate_rate_hz
-from mosaico_ingest.view.values import value_text
+from mosaico_ingest.view.texts import value_text
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"
 DRIVE = JOB.parent / "quickstart" / "drive.mcap"

@@ -10,13 +10,12 @@ import pytest
 from mosaico_ingest import RosbagInjector, ROSInjectionConfig
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.view.chart import chart_lines
+from mosaico_ingest.view.columns import describe_topic
 from mosaico_ingest.view.pictures import has_pictures, row_picture
 from mosaico_ingest.view.rows import first_rows, last_rows, nearest_row
-from mosaico_ingest.view.series import plot_fields, read_series
-from mosaico_ingest.view.statistics import describe_topic
+from mosaico_ingest.view.series import chart_lines, plot_fields, read_series
+from mosaico_ingest.view.texts import json_value, scalar_text
 from mosaico_ingest.view.tracks import local_meters, read_track
-from mosaico_ingest.view.values import json_value, scalar_text
 
 
 def ingested(corpus: Path, folder: Path) -> Store:

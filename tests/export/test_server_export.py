@@ -30,10 +30,8 @@ from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.export import ExportReport, export_sequence
-from mosaico_ingest.export.columns import as_type, comparable
-from mosaico_ingest.export.extractor import ROSExtractorConfig, ROSSequenceExtractor
-from mosaico_ingest.export.loader import MosaicoToROSLoader
-from mosaico_ingest.export.sources import ServerSequence
+from mosaico_ingest.export.official_bridge import MosaicoToROSLoader, ROSExtractorConfig, ROSSequenceExtractor
+from mosaico_ingest.export.sources import ServerSequence, as_type, comparable
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget, Stores
 from mosaico_ingest.ontology import Integer64

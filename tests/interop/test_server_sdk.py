@@ -19,7 +19,7 @@ from mosaico_ingest.api import RosbagInjector
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.export import export_sequence
-from mosaico_ingest.export.loader import MosaicoToROSLoader
+from mosaico_ingest.export.official_bridge import MosaicoToROSLoader
 from mosaico_ingest.export.sources import ServerSequence
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import ServerTarget

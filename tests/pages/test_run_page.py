@@ -24,7 +24,7 @@ from mosaico_ingest.report.files import read_report
 from mosaico_ingest.report.markdown import markdown_summary
 from mosaico_ingest.report.model import Steps, UnreadableRange
 from mosaico_ingest.rosbag.loader import ROSLoader
-from mosaico_ingest.view.values import value_text
+from mosaico_ingest.view.texts import value_text
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -24,11 +24,10 @@ from mosaico_ingest.job.values import select
 from mosaico_ingest.protocol.errors import Condition, as_flight_error, condition_of
 from mosaico_ingest.protocol.messages import Permission
 from mosaico_ingest.serve import Keyring, Server, query, serve
-from mosaico_ingest.serve.clusters import clusterize, intersect
-from mosaico_ingest.serve.errors import Deadline, Refusal
-from mosaico_ingest.serve.keys import MAX_REFUSED_SCHEMAS
+from mosaico_ingest.serve.actions import clusterize, intersect
+from mosaico_ingest.serve.flights import Uploads
+from mosaico_ingest.serve.guard import MAX_REFUSED_SCHEMAS, Deadline, Refusal
 from mosaico_ingest.serve.query import Glob, run
-from mosaico_ingest.serve.uploads import Uploads
 
 Rows = Callable[..., pa.RecordBatch]
 STARS = "a*" * 40 + "b"
@@ -174,7 +173,7 @@ def test_sequence_name_above_255_characters_is_refused(client: Client) -> None:
 def test_abandoned_sessions_make_way_for_new_ones(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
     store.create_sequence("drive", {})
     uploads = Uploads(store)
-    monkeypatch.setattr("mosaico_ingest.serve.uploads._MAX_SESSIONS", 3)
+    monkeypatch.setattr("mosaico_ingest.serve.flights._MAX_SESSIONS", 3)
     opened = [uploads.open("drive") for _ in range(3)]
     with pytest.raises(Refusal) as raised:
         uploads.open("drive")

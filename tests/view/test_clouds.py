@@ -12,16 +12,17 @@ import pytest
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.ontology.registry import builtin_type
-from mosaico_ingest.view.clouds import (
+from mosaico_ingest.view.pictures import (
     Points,
     from_above,
     grid_pixels,
     grid_step,
     has_grid,
+    has_pictures,
     has_points,
+    row_picture,
     row_points,
 )
-from mosaico_ingest.view.pictures import has_pictures, row_picture
 from mosaico_ingest.view.rows import nearest_row
 
 XYZ = [(1.0, 2.0, 3.0), (math.nan, 0.0, 0.0), (4.0, -5.0, 6.0)]

@@ -14,7 +14,7 @@ from PIL import Image
 
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.images import color_map, run_length_depth
-from mosaico_ingest.view.images import contact_sheet, decode_image, fit_pixels, has_images, png_bytes
+from mosaico_ingest.view.pictures import contact_sheet, decode_image, fit_pixels, has_images, png_bytes
 
 HEIGHT, WIDTH = 6, 8
 RED, GREEN, BLUE = (200, 30, 20), (20, 180, 40), (10, 20, 220)

@@ -9,7 +9,7 @@ import pytest
 from stored_sequences import LOG, TEXT, ontology, write_sequence
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.view.logs import LogLine, has_log, read_excerpt
+from mosaico_ingest.view.texts import LogLine, has_log, read_excerpt
 
 DIAGNOSTICS = ontology(
     "DiagnosticArray",

@@ -16,8 +16,7 @@ from PIL import Image
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.ontology.registry import OntologyType
-from mosaico_ingest.view.chart import chart_lines, write_chart
-from mosaico_ingest.view.series import Series, _Envelope, plot_fields, read_series
+from mosaico_ingest.view.series import Series, _Envelope, chart_lines, plot_fields, read_series, write_chart
 
 READS_NULL_FIXED_LISTS = pytest.mark.skipif(
     int(pa.__version__.partition(".")[0]) < 26,

@@ -16,9 +16,8 @@ from hypothesis import strategies as st
 from mosaico_ingest.destinations.base import topic_schema
 from mosaico_ingest.destinations.store import Store, TopicInfo
 from mosaico_ingest.ontology.registry import UNITS, OntologyType, builtin_type, column_unit
-from mosaico_ingest.view import statistics as view_statistics
-from mosaico_ingest.view.columns import topic_columns
-from mosaico_ingest.view.statistics import ColumnStatistics, describe_topic, topic_timing
+from mosaico_ingest.view import columns as view_statistics
+from mosaico_ingest.view.columns import ColumnStatistics, describe_topic, topic_columns, topic_timing
 
 KIND = OntologyType(
     "Sample",

@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.view.transforms import FrameEdge, FrameNode, frame_trees, read_edges
+from mosaico_ingest.view.tracks import FrameEdge, FrameNode, frame_trees, read_edges
 
 
 def edge(parent: str, child: str) -> FrameEdge:

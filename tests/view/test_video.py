@@ -13,10 +13,9 @@ from stored_sequences import IMAGE, ontology
 
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.errors import IngestError, ViewError
-from mosaico_ingest.view import video
-from mosaico_ingest.view.pictures import row_picture, thumbnails
+from mosaico_ingest.view import pictures as video
+from mosaico_ingest.view.pictures import row_picture, thumbnails, video_codec, video_frames
 from mosaico_ingest.view.rows import nearest_row
-from mosaico_ingest.view.video import video_codec, video_frames
 
 av: Any = pytest.importorskip("av", reason="PyAV encodes the videos of these tests")
 

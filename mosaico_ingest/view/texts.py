@@ -1,22 +1,26 @@
-"""Values of rows as text for people: times as times, bytes as size and kind, long values shortened."""
+"""Texts for people: values of rows, and excerpts of log and text topics."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Mapping, Sequence
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime, timezone
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.types as pt
 from msgspec import Struct
 
+from mosaico_ingest.destinations.store.model import TopicInfo
+from mosaico_ingest.destinations.store.store import Window, scan
+from mosaico_ingest.images.files import image_file_type
 from mosaico_ingest.report.units import bytes_text, count_text, counted, time_text
-from mosaico_ingest.view.images import image_file_type
 
 if TYPE_CHECKING:
-    from mosaico_ingest.view.statistics import ColumnStatistics
+    from mosaico_ingest.view.columns import ColumnStatistics
 
 BOUND_WIDTH = 20
 """Characters of the smallest and the largest value of a column."""
@@ -25,6 +29,14 @@ _FIRST_INSTANT_NS = 10**17
 """Times before March 1973 are durations, or times of a simulation, which starts at 0."""
 _PARTS = (("seconds", "nanoseconds"), ("sec", "nanosec"), ("secs", "nsecs"))
 _VIDEO_START = b"\0\0\0\1"
+MAX_ROWS = 200_000
+"""Rows of a topic that are searched."""
+MAX_TEXT = 500
+"""Characters of a line."""
+LEVELS_ROS1 = {1: "debug", 2: "info", 4: "warning", 8: "error", 16: "fatal"}
+LEVELS_ROS2 = {10: "debug", 20: "info", 30: "warning", 40: "error", 50: "fatal"}
+LEVELS_DIAGNOSTICS = {0: "ok", 1: "warning", 2: "error", 3: "stale"}
+SEVERE = {"warning", "error", "fatal", "stale"}
 
 
 def value_text(value: object, width: int) -> str:
@@ -198,3 +210,101 @@ def _members_text(members: Sequence[str], brackets: str, noun: str, width: int, 
         first.append(member)
     members_text = ", ".join((*first, "…")) if first or not members else f"{members[0][:width]}…"
     return f"{brackets[0]}{members_text}{brackets[1]} ({counted(count, noun)})"
+
+
+class LogLine(Struct, frozen=True):
+    """One line of a log."""
+
+    time_ns: int
+    level: str
+    """`debug`, `info`, `warning`, `error` or `fatal`; empty if the topic has no levels."""
+    source: str
+    """The node or component; empty if the topic has none."""
+    text: str
+
+
+class LogExcerpt(Struct, frozen=True):
+    """The lines of one topic that matter most."""
+
+    topic: str
+    lines: tuple[LogLine, ...]
+    counts: dict[str, int]
+    """Number of lines by level."""
+    is_severe: bool
+    """Whether `lines` are warnings and errors; otherwise they are the first lines."""
+
+
+def has_log(topic: TopicInfo) -> bool:
+    """Return whether the rows of a topic are lines of a log, diagnostics or texts."""
+    return _kind(topic.schema) is not None
+
+
+def read_excerpt(topic: TopicInfo, count: int = 50) -> LogExcerpt | None:
+    """Return the first `count` warnings and errors of a topic, or its first lines if it has none; None without lines."""
+    first: list[LogLine] = []
+    severe: list[LogLine] = []
+    counts: Counter[str] = Counter()
+    for line in log_lines(topic):
+        counts[line.level] += 1
+        if len(first) < count:
+            first.append(line)
+        if line.level in SEVERE and len(severe) < count:
+            severe.append(line)
+    if not first:
+        return None
+    return LogExcerpt(topic.name, tuple(severe or first), dict(counts), bool(severe))
+
+
+def _kind(schema: pa.Schema) -> str | None:
+    names = set(schema.names)
+    if {"level", "msg"} <= names and _is_text(schema.field("msg").type):
+        return "log"
+    if "status" in names and pt.is_list(schema.field("status").type):
+        item: Any = schema.field("status").type
+        members = {member.name for member in item.value_type} if pt.is_struct(item.value_type) else set[str]()
+        return "diagnostics" if {"level", "message", "name"} <= members else None
+    if names == {"timestamp_ns", "data"} and _is_text(schema.field("data").type):
+        return "text"
+    return None
+
+
+def log_lines(topic: TopicInfo) -> Iterator[LogLine]:
+    """Yield the lines of the first `MAX_ROWS` rows in order of time; none if the topic has no lines."""
+    kind = _kind(topic.schema)
+    fields = {"log": ["level", "name", "msg"], "diagnostics": ["status"], "text": ["data"]}.get(
+        kind or "", []
+    )
+    names = [topic.schema.names[0], *(name for name in fields if name in topic.schema.names)]
+    schema = pa.schema([topic.schema.field(name) for name in names])
+    rows = 0
+    for batch in scan(topic.segments, schema, Window()) if kind else ():
+        for row in batch.slice(0, MAX_ROWS - rows).to_pylist():
+            yield from _row_lines(kind or "", row)
+        rows += batch.num_rows
+        if rows >= MAX_ROWS:
+            return
+
+
+def _row_lines(kind: str, row: dict[str, Any]) -> Iterator[LogLine]:
+    time_ns = int(row["timestamp_ns"])
+    if kind == "text":
+        yield LogLine(time_ns, "", "", str(row["data"])[:MAX_TEXT])
+    elif kind == "log":
+        code = _number(row["level"])
+        level = LEVELS_ROS2.get(code) or LEVELS_ROS1.get(code) or str(code)
+        yield LogLine(time_ns, level, str(row.get("name") or "")[:MAX_TEXT], str(row["msg"])[:MAX_TEXT])
+    else:
+        for status in row["status"] or ():
+            level = LEVELS_DIAGNOSTICS.get(_number(status["level"]), "")
+            yield LogLine(time_ns, level, str(status["name"])[:MAX_TEXT], str(status["message"])[:MAX_TEXT])
+
+
+def _number(value: object) -> int:
+    """Return a level; ROS 2 stores that of diagnostics as one byte."""
+    if isinstance(value, bytes):
+        return int.from_bytes(value[:1], "little")
+    return value if isinstance(value, int) else -1
+
+
+def _is_text(kind: pa.DataType) -> bool:
+    return pt.is_string(kind) or pt.is_large_string(kind)
