@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from fnmatch import fnmatchcase
 from math import isfinite
 from typing import TYPE_CHECKING, Any
@@ -119,6 +119,8 @@ class Contract(Struct, frozen=True):
     expect: Expectations
     group: tuple[ExpectationResult, ...] = ()
     """The results of the expectations of the group that the recording belongs to."""
+    _of_topics: dict[str, dict[str, Clause]] = {}
+    """The results of `topic_clauses`, by topic."""
 
     @classmethod
     def of(cls, job: Job, group: tuple[ExpectationResult, ...] = ()) -> Contract | None:
@@ -145,19 +147,11 @@ class Contract(Struct, frozen=True):
         patterns = [pattern for key in ("required", "forbidden") for pattern, _ in self.pattern_clauses(key)]
         return any(fnmatchcase(topic, pattern) for pattern in patterns)
 
-    def topic_clauses(self, topic: str) -> dict[str, Clause]:
+    def topic_clauses(self, topic: str) -> Mapping[str, Clause]:
         """Return the expectations that apply to a topic by key, without those of `fields`."""
-        clauses: dict[str, Clause] = {}
-        for name in TopicExpectations.model_fields:
-            glob = None if name in {"severity", "fields"} else self.expect.entry_of(topic, name)
-            if glob is None:
-                continue
-            entry = self.expect.topics[glob]
-            value = getattr(entry, name)
-            if value is not None:
-                path = ("expect", "topics", glob, name)
-                clauses[name] = self._clause(path, value, entry.severity, topic)
-        return clauses
+        if topic not in self._of_topics:
+            self._of_topics[topic] = self._topic_clauses(topic)
+        return self._of_topics[topic]
 
     def field_clauses(self, topic: str) -> Iterator[tuple[str, FieldExpectations, list[Clause]]]:
         """Yield the expressions that apply to a topic, each with its expectations."""
@@ -185,6 +179,19 @@ class Contract(Struct, frozen=True):
             value = getattr(section, name)
             if value is not None:
                 yield self._clause(("expect", "group", name), value, section.severity)
+
+    def _topic_clauses(self, topic: str) -> dict[str, Clause]:
+        clauses: dict[str, Clause] = {}
+        for name in TopicExpectations.model_fields:
+            glob = None if name in {"severity", "fields"} else self.expect.entry_of(topic, name)
+            if glob is None:
+                continue
+            entry = self.expect.topics[glob]
+            value = getattr(entry, name)
+            if value is not None:
+                path = ("expect", "topics", glob, name)
+                clauses[name] = self._clause(path, value, entry.severity, topic)
+        return clauses
 
     def _clause(
         self,

@@ -5,11 +5,11 @@ from __future__ import annotations
 import re
 from collections import defaultdict
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
+from msgspec import Struct, field
 
 from mosaico_ingest.contracts.clauses import ORDER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
@@ -25,9 +25,11 @@ if TYPE_CHECKING:
     from mosaico_ingest.adapters.adapter import Adapted
     from mosaico_ingest.contracts.rows import RowMonitor
 
+_NONE = np.zeros(0, np.int64)
+
 
 class RecordingMonitor:
-    """Observes the messages of a recording for a contract whose expressions fit its topics (`row_monitor.check_expressions`)."""
+    """Observes the messages of a recording for a contract whose expressions fit its topics (`rows.check_expressions`)."""
 
     def __init__(
         self,
@@ -298,14 +300,13 @@ def _metadata_key(name: str) -> str:
     return re.sub(r"[^A-Za-z0-9_]+", "_", name).strip("_") or "_"
 
 
-@dataclass(slots=True)
-class TopicMonitor:
+class TopicMonitor(Struct):
     """Observes the messages of one topic."""
 
     name: str
     clauses: Mapping[str, Clause]
     times: TopicTimes
-    rows: dict[int, RowMonitor] = field(default_factory=dict)
+    rows: dict[int, RowMonitor] = field(default_factory=dict[int, "RowMonitor"])
     """By connection."""
     has_rows: bool = False
     """Whether an expectation refers to rows, not only to log times and the order in the files."""
@@ -344,8 +345,7 @@ class TopicMonitor:
             rows.finish()
 
 
-@dataclass(slots=True)
-class BlockObserver:
+class BlockObserver(Struct):
     """Passes the blocks of one connection to the monitors of its topic; called in this order for each block."""
 
     topic: TopicMonitor
@@ -361,7 +361,7 @@ class BlockObserver:
     """Position on the topic of the first observed message of the current block."""
     _skipped: int = 0
     """Number of messages of the current block before the range."""
-    _log_times: Int64s = field(default_factory=lambda: np.zeros(0, np.int64))
+    _log_times: Int64s = _NONE
     """Log times of the observed messages of the current block."""
 
     @property
@@ -394,17 +394,28 @@ class BlockObserver:
         first = monitor.add_block(self.connection, messages.log_times)
         of_rows = monitor.rows.get(self.connection)
         if of_rows is not None:
-            positions = np.arange(first, first + len(rows), dtype=np.int64)
-            of_rows.add_stored(rows, Batch(messages.log_times, positions))
+            of_rows.add_stored(rows, Batch(messages.log_times, first))
 
     def _observed(self, rows: pa.StructArray, index: Int64s) -> tuple[pa.StructArray, Batch]:
         """Return the rows inside the range, with their log times and positions on the topic."""
+        count = len(self._log_times)
+        if len(index) == count and _are_consecutive(index, self._skipped):
+            return rows, Batch(self._log_times, self._first)
         positions = index - self._skipped
-        inside = (positions >= 0) & (positions < len(self._log_times))
+        inside = (positions >= 0) & (positions < count)
         if not inside.all():
             rows, positions = rows.filter(pa.array(inside)), positions[inside]
-        times = self._log_times[positions]
-        return rows, Batch(times, positions + self._first)
+        return rows, Batch(self._log_times[positions], self._first, positions)
+
+
+def _are_consecutive(index: Int64s, first: int) -> bool:
+    """Return whether an ascending index has every position from `first`, each of them once."""
+    count = len(index)
+    return not count or (
+        int(index[0]) == first
+        and int(index[-1]) == first + count - 1
+        and bool((index[1:] > index[:-1]).all())
+    )
 
 
 def topic_monitor(contract: Contract, name: str, references: Iterable[str] = ()) -> TopicMonitor | None:

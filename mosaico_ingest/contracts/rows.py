@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -88,8 +87,7 @@ class FieldCheck(Struct, frozen=True):
     accumulator: Accumulator
 
 
-@dataclass(slots=True)
-class RowMonitor:
+class RowMonitor(Struct):
     """Observes the rows of one connection, or of one stored topic."""
 
     topic: str
@@ -273,8 +271,7 @@ def _expression_findings(
     return list(findings)
 
 
-@dataclass(slots=True)
-class AllowedTexts:
+class AllowedTexts(Struct):
     """Texts that must be in a set, such as frame ids."""
 
     allowed: tuple[str, ...]
@@ -329,9 +326,16 @@ def _member(rows: Array, *names: str) -> Array | None:
 
 
 def _times(times: Array | None, parts: tuple[str, str]) -> NDArray[np.int64] | None:
-    if times is None or any(_member(times, part) is None for part in parts):
+    fields = [None if times is None else _member(times, part) for part in parts]
+    columns = [column for column in fields if column is not None]
+    if len(columns) < len(parts):
         return None
-    return _numbers(time_ns(times, parts))
+    if any(column.null_count for column in columns):
+        return _numbers(time_ns(times, parts))
+    seconds, nanoseconds = map(np.asarray, columns)
+    stamps = np.multiply(seconds, 1_000_000_000, dtype=np.int64)
+    stamps += nanoseconds.astype(np.int64, copy=False)
+    return stamps
 
 
 def _numbers(array: Array) -> NDArray[Any]:

@@ -86,7 +86,7 @@ def _observe(
         if rows is None or not len(times):
             continue
         struct = struct_of(batch.columns[1:], topic.ontology.struct, None, batch.num_rows)
-        of_batch = Batch(times, np.arange(first, first + len(times), dtype=np.int64))
+        of_batch = Batch(times, first)
         rows.add_stored(struct, of_batch)
         if restores and messages is not None:
             restored = messages.inverse.restore(struct, Envelope(topic.name, _msgtype(topic), times))

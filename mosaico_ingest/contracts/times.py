@@ -13,15 +13,14 @@ from __future__ import annotations
 import threading
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
-from mosaico_ingest.contracts.values import missing_between
+from mosaico_ingest.contracts.values import differences, missing_between
 from mosaico_ingest.job.values import Interval
 from mosaico_ingest.rosbag.blocks import LATEST_NS, Connection, Encoding, Int64s, MessageBlock, fixed_slices
 from mosaico_ingest.rosbag.recording import Recording
@@ -56,16 +55,15 @@ class Gap(Struct, frozen=True):
         return self.end_ns - self.start_ns
 
 
-@dataclass(slots=True)
-class Gaps:
+class Gaps(Struct):
     """The intervals that are longer than a limit."""
 
     over: Interval
-    lengths: Int64s = field(default_factory=lambda: _NONE)
+    lengths: Int64s = _NONE
     """Length of each long interval in nanoseconds, shape (n,)."""
-    ends: Int64s = field(default_factory=lambda: _NONE)
+    ends: Int64s = _NONE
     """Log time of the message that ends each long interval, shape (n,)."""
-    indexes: Int64s = field(default_factory=lambda: _NONE)
+    indexes: Int64s = _NONE
     """Position on the topic of the message that ends each long interval, shape (n,)."""
     total: int = 0
     """Number of intervals."""
@@ -78,14 +76,14 @@ class Gaps:
     def __post_init__(self) -> None:
         self.limit_ns = self.over.ns
 
-    def add(self, intervals: Int64s, ends: Int64s, index: int) -> None:
-        """Add intervals; `index` is the position of the message that ends the first one."""
+    def add(self, intervals: Int64s, ends: Int64s, index: int, longest_ns: int) -> None:
+        """Add intervals; `index` is the position of the message that ends the first one, `longest_ns` their maximum."""
         self.total += len(intervals)
         if self.limit_ns is None:
             self._pending.append((intervals, ends, index))
             if self.total >= PERIOD_SAMPLE:
                 self._resolve()
-        else:
+        elif longest_ns > self.limit_ns:
             self._select(intervals, ends, index)
 
     def finish(self) -> None:
@@ -124,8 +122,7 @@ class WindowExtreme(Struct, frozen=True):
     """Position on the topic of the message at which the window starts."""
 
 
-@dataclass(slots=True)
-class SlidingWindow:
+class SlidingWindow(Struct):
     """The lowest and the highest number of messages in windows of one length.
 
     For the highest number, a window starts with a message; for the lowest number, it starts right after a message and
@@ -141,7 +138,7 @@ class SlidingWindow:
     highest: WindowExtreme | None = None
     violations: int = 0
     first: WindowExtreme | None = None
-    _times: Int64s = field(default_factory=lambda: _NONE)
+    _times: Int64s = _NONE
     """Log times from the first message whose window may not be complete."""
     _index: int = 0
     """Position on the topic of the first of `_times`."""
@@ -192,8 +189,7 @@ class SlidingWindow:
         return WindowExtreme(int(counts[position]), int(self._times[position]), self._index + position)
 
 
-@dataclass(slots=True)
-class TopicTimes:
+class TopicTimes(Struct):
     """The log times of one topic: count, span, longest interval, and the accumulators of its expectations."""
 
     gaps: dict[str, Gaps] = field(default_factory=dict[str, Gaps])
@@ -237,12 +233,11 @@ class TopicTimes:
             window.finish()
 
     def _add_intervals(self, times: Int64s, index: int) -> None:
+        steps = differences(times, self._previous)
         if self._previous is None:
-            ends, index = times[1:], index + 1
-            intervals = np.diff(times)
+            ends, intervals, index = times[1:], steps[1:], index + 1
         else:
-            ends = times
-            intervals = np.diff(times, prepend=self._previous)
+            ends, intervals = times, steps
         if not len(intervals):
             return
         position = int(intervals.argmax())
@@ -251,7 +246,7 @@ class TopicTimes:
             end = int(ends[position])
             self.longest = Gap(end - length, end, index + position)
         for gaps in self.gaps.values():
-            gaps.add(intervals, ends, index)
+            gaps.add(intervals, ends, index, length)
 
 
 class FileStep(Struct, frozen=True):

@@ -6,11 +6,10 @@ log-time order, and the state that is carried across batches makes the result in
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from numpy.typing import NDArray
 
 from mosaico_ingest.job.values import Limit
@@ -44,19 +43,30 @@ class Violation(Struct, frozen=True):
 
 
 class Batch(Struct, frozen=True):
-    """The messages of a batch: log times and positions on the topic of its rows, shape (n,)."""
+    """Consecutive messages of a topic, or some of them."""
 
     log_times: NDArray[np.int64]
-    indexes: NDArray[np.int64]
+    """Log time of each row, shape (n,)."""
+    first: int = 0
+    """Position on the topic of the first message."""
+    positions: NDArray[np.int64] | None = None
+    """Position of each row after `first`, shape (n,); None for one row per message."""
+
+    @property
+    def indexes(self) -> NDArray[np.int64]:
+        """The position of each row on the topic, shape (n,)."""
+        if self.positions is None:
+            return np.arange(self.first, self.first + len(self.log_times), dtype=np.int64)
+        return self.positions + self.first
 
     def violation(self, row: int, value: Any) -> Violation:  # noqa: ANN401 - a numpy scalar or a Python value
         """Return the violation of one row."""
         plain = value.item() if isinstance(value, np.generic) else value
-        return Violation(int(self.log_times[row]), int(self.indexes[row]), plain)
+        position = row if self.positions is None else int(self.positions[row])
+        return Violation(int(self.log_times[row]), self.first + position, plain)
 
 
-@dataclass(slots=True)
-class Violations:
+class Violations(Struct):
     """The number of violations, the first one, and the worst one."""
 
     count: int = 0
@@ -96,8 +106,7 @@ def plain_values(data: NDArray[Any]) -> Values:
     return Values(data, None, None)
 
 
-@dataclass(slots=True)
-class LatencyRange:
+class LatencyRange(Struct):
     """Log time minus header stamp; a stamp of zero is a violation without a value."""
 
     min_ns: int | None
@@ -113,42 +122,41 @@ class LatencyRange:
         """Add the stamps of a batch."""
         if not len(stamps):
             return
-        latency = batch.log_times - stamps
-        unset = stamps == 0
         self.count += len(stamps)
-        excess = np.full(len(stamps), -np.inf)
-        if self.max_ns is not None:
-            excess = np.maximum(excess, latency - float(self.max_ns))
-        if self.min_ns is not None:
-            excess = np.maximum(excess, float(self.min_ns) - latency)
-        bad = excess > 0
-        if unset.any():
-            self.unset += int(unset.sum())
-            bad |= unset
-            excess = np.where(unset, 0.0, excess)
-            positions = np.flatnonzero(~unset)
+        latency = batch.log_times - stamps
+        unset = stamps == 0 if np.count_nonzero(stamps) < len(stamps) else None
+        if unset is None:
+            low, high = int(latency.argmin()), int(latency.argmax())
         else:
-            positions = None
-        self.violations.add(batch, Values(latency, unset if unset.any() else None, None), bad, excess)
-        self._note_extremes(batch, latency, positions)
-
-    def _note_extremes(
-        self, batch: Batch, latency: NDArray[np.int64], positions: NDArray[np.int64] | None
-    ) -> None:
-        if positions is not None and not len(positions):
-            return
-        candidates = latency if positions is None else latency[positions]
-        low, high = int(candidates.argmin()), int(candidates.argmax())
-        if positions is not None:
-            low, high = int(positions[low]), int(positions[high])
+            self.unset += int(unset.sum())
+            positions = np.flatnonzero(~unset)
+            if not len(positions):
+                self.violations.add(batch, Values(latency, unset, None), unset, np.zeros(len(stamps)))
+                return
+            low = int(positions[latency[positions].argmin()])
+            high = int(positions[latency[positions].argmax()])
         if self.lowest is None or latency[low] < self.lowest.value:
             self.lowest = batch.violation(low, latency[low])
         if self.highest is None or latency[high] > self.highest.value:
             self.highest = batch.violation(high, latency[high])
+        is_low = self.min_ns is not None and latency[low] < self.min_ns
+        is_high = self.max_ns is not None and latency[high] > self.max_ns
+        if is_low or is_high or unset is not None:
+            self._add_violations(batch, latency, unset)
+
+    def _add_violations(self, batch: Batch, latency: NDArray[np.int64], unset: Mask | None) -> None:
+        excess = np.full(len(latency), -np.inf)
+        if self.max_ns is not None:
+            excess = np.maximum(excess, latency - float(self.max_ns))
+        if self.min_ns is not None:
+            excess = np.maximum(excess, float(self.min_ns) - latency)
+        if unset is not None:
+            excess[unset] = 0.0
+        bad = excess > 0 if unset is None else (excess > 0) | unset
+        self.violations.add(batch, Values(latency, unset, None), bad, excess)
 
 
-@dataclass(slots=True)
-class Steps:
+class Steps(Struct):
     """The differences between consecutive header stamps: negative ones (`monotonic`) or zero (`unique`)."""
 
     monotonic: bool
@@ -161,17 +169,17 @@ class Steps:
         if not len(stamps):
             return
         self.count += len(stamps)
-        first = int(stamps[0]) if self._previous is None else self._previous
-        steps = np.diff(stamps, prepend=first)
-        bad = steps < 0 if self.monotonic else steps == 0
+        steps = differences(stamps, self._previous)
         if self._previous is None:
-            bad[0] = False
+            steps[0] = 1
         self._previous = int(stamps[-1])
-        self.violations.add(batch, plain_values(steps), bad, -steps.astype(np.float64))
+        is_good = int(steps.min()) >= 0 if self.monotonic else np.count_nonzero(steps) == len(steps)
+        if not is_good:
+            bad = steps < 0 if self.monotonic else steps == 0
+            self.violations.add(batch, plain_values(steps), bad, -steps.astype(np.float64))
 
 
-@dataclass(slots=True)
-class MissingNumbers:
+class MissingNumbers(Struct):
     """The sequence numbers that no message has, between consecutive messages."""
 
     count: int = 0
@@ -186,12 +194,22 @@ class MissingNumbers:
         if not len(numbers):
             return
         self.count += len(numbers)
-        first = int(numbers[0]) - 1 if self._previous is None else self._previous
-        missing = missing_between(np.diff(numbers, prepend=first))
+        steps = differences(numbers, self._previous)
+        if self._previous is None:
+            steps[0] = 1
+        missing = missing_between(steps)
         self._previous = int(numbers[-1])
         self.is_zero = self.is_zero and not numbers.any()
         self.missing += int(missing.sum())
         self.violations.add(batch, plain_values(missing), missing > 0, missing.astype(np.float64))
+
+
+def differences(values: NDArray[np.int64], previous: int | None) -> NDArray[np.int64]:
+    """Return the difference of each value to the value before it, shape (n,); the first one is zero without `previous`."""
+    result = np.empty_like(values)
+    np.subtract(values[1:], values[:-1], out=result[1:])
+    result[:1] = 0 if previous is None else values[:1] - previous
+    return result
 
 
 def missing_between(steps: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -200,8 +218,7 @@ def missing_between(steps: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.where(wrapped > 1, wrapped - 1, 0)
 
 
-@dataclass(slots=True)
-class NumberLimits:
+class NumberLimits(Struct):
     """Numbers between two bounds; NaN is outside of every range, and null inside."""
 
     low: float = -np.inf
@@ -241,8 +258,7 @@ class NumberLimits:
         self.highest = high if self.highest is None else max(self.highest, high)
 
 
-@dataclass(slots=True)
-class FiniteNumbers:
+class FiniteNumbers(Struct):
     """Numbers that are neither NaN nor infinite."""
 
     count: int = 0
@@ -258,8 +274,7 @@ class FiniteNumbers:
             self.violations.add(batch, values, bad if values.null is None else bad & ~values.null)
 
 
-@dataclass(slots=True)
-class Nulls:
+class Nulls(Struct):
     """The number of nulls among the values."""
 
     limit: Limit
@@ -273,8 +288,7 @@ class Nulls:
             self.violations.add(batch, values, values.null)
 
 
-@dataclass(slots=True)
-class AllowedValues:
+class AllowedValues(Struct):
     """Values that must be in a set; null is allowed."""
 
     allowed: tuple[Any, ...]
@@ -295,8 +309,7 @@ class AllowedValues:
             self.violations.add(batch, values, bad if values.null is None else bad & ~values.null)
 
 
-@dataclass(slots=True)
-class Moments:
+class Moments(Struct):
     """The mean and the standard deviation of the finite values."""
 
     count: int = 0
@@ -328,8 +341,7 @@ class Moments:
         self.count = total
 
 
-@dataclass(slots=True)
-class Changes:
+class Changes(Struct):
     """The absolute differences between the values of consecutive messages; one without a finite value has none."""
 
     low: float = -np.inf
@@ -365,8 +377,7 @@ class Changes:
             self.violations.add(batch, plain_values(changes), bad, excess)
 
 
-@dataclass(slots=True)
-class Unchanged:
+class Unchanged(Struct):
     """The runs of consecutive messages with the same value; NaN equals NaN, and null equals null."""
 
     max_ns: int
@@ -420,7 +431,7 @@ class Unchanged:
         lengths = ends - begins
         self.longest_ns = max(self.longest_ns, int(lengths.max()))
         excess = lengths - float(self.max_ns)
-        self.violations.add(Batch(ends, indexes), plain_values(lengths), excess > 0, excess)
+        self.violations.add(Batch(ends, 0, indexes), plain_values(lengths), excess > 0, excess)
 
 
 def _same(left: NDArray[Any], right: NDArray[Any], null: Mask, other_null: Mask) -> Mask:

@@ -46,7 +46,7 @@ def parts(length: int, cuts: list[int]) -> list[slice]:
 def batches(times: list[int], cuts: list[int]) -> list[tuple[slice, Batch]]:
     array = np.array(times, np.int64)
     indexes = np.arange(len(times), dtype=np.int64)
-    return [(part, Batch(array[part], indexes[part])) for part in parts(len(times), cuts)]
+    return [(part, Batch(array[part], 0, indexes[part])) for part in parts(len(times), cuts)]
 
 
 def as_values(values: list[float | None]) -> Values:
@@ -236,7 +236,7 @@ def test_missing_numbers_wrap_around_and_restart_are_no_gaps() -> None:
     numbers = MissingNumbers()
     for part in ([2**32 - 2, 2**32 - 1, 0, 1], [4, 5], [0, 1]):
         array = np.array(part, np.int64)
-        numbers.add(Batch(array, np.arange(len(array))), array)
+        numbers.add(Batch(array), array)
     assert (numbers.missing, numbers.violations.count) == (2, 1)
 
 
