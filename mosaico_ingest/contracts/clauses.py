@@ -130,6 +130,8 @@ class Contract(Struct, frozen=True):
     def recording_clauses(self) -> Iterator[Clause]:
         """Yield the expectations of the recording."""
         section = self.expect.recording
+        if section is None:
+            return
         for name in type(section).model_fields:
             value = getattr(section, name)
             if name != "severity" and value is not None:

@@ -413,7 +413,7 @@ class Expectations(Section):
     (commit as `<name>__failed`, exit code 6)."""
     severity: SeverityName = "error"
     """The default severity of the expectations. A failure with the severity `warning` is only reported."""
-    recording: RecordingExpectations = RecordingExpectations()
+    recording: RecordingExpectations | None = None
     """Expectations of the recording."""
     required: tuple[TopicItem, ...] = Field(default=(), examples=[["/imu", "/camera/*/image_raw"]])
     """Topic names and globs, or `{topic: …, severity: …}`; each must match a topic with at least one message."""

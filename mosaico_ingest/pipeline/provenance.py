@@ -561,8 +561,9 @@ def _class_text(adapter: type[Any]) -> bytes:
 
 @cache_by_identity
 def _text(section: object) -> bytes:
-    """Return a section as JSON; all jobs of a manifest share most of their sections."""
-    return to_json(section)
+    """Return a section as text; all jobs of a manifest share most of their sections."""
+    # JSON would need the serializer of the section's class, which takes 5 ms to build for `expect`.
+    return repr(section).encode("utf-8", "surrogateescape")
 
 
 @cache_by_identity
