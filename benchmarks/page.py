@@ -42,7 +42,7 @@ def main() -> None:
 def write_report(path: Path, recordings: int) -> None:
     """Write a report in which the quickstart's recording is repeated."""
     from mosaico_ingest import api  # noqa: PLC0415 - the process that measures stays small
-    from mosaico_ingest.report.files import RunReport  # noqa: PLC0415 - the process that measures stays small
+    from mosaico_ingest.report.run import RunReport  # noqa: PLC0415 - the process that measures stays small
 
     (job,) = api.compile_job(JOB)
     one = api.run([job.replace(target=job.target.replace(store=str(path.parent / "store")))]).recordings[0]

@@ -22,7 +22,7 @@ from measure import Sample, run
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.report.files import read_report
+from mosaico_ingest.report.run import read_report
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.mcap.writer import McapWriter

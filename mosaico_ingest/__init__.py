@@ -41,8 +41,8 @@ if TYPE_CHECKING:
     )
     from mosaico_ingest.ontology import Message, Serializable
     from mosaico_ingest.protocol.messages import Permission as APIKeyPermissionEnum
-    from mosaico_ingest.report.files import RunReport
-    from mosaico_ingest.report.model import Report
+    from mosaico_ingest.report.recording import Report
+    from mosaico_ingest.report.run import RunReport
     from mosaico_ingest.rosbag.blocks import ROSMessage
     from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
     from mosaico_ingest.rosbag.loader import ROSLoader
@@ -86,9 +86,9 @@ _MODULES = {
     "ROSLoader": "rosbag.loader",
     "ROSMessage": "rosbag.blocks",
     "ROSTypeRegistry": "rosbag.definitions.registry",
-    "Report": "report.model",
+    "Report": "report.recording",
     "RosbagInjector": "api",
-    "RunReport": "report.files",
+    "RunReport": "report.run",
     "Serializable": "ontology",
     "SessionLevelErrorPolicy": "job.values",
     "Store": "destinations.store",

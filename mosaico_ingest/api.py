@@ -28,8 +28,8 @@ from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.remote import AnyPath, as_path
 from mosaico_ingest.report.events import BatchObserver, Observer, ignore_batch, ignore_events
-from mosaico_ingest.report.files import RunReport, UsedManifest
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
+from mosaico_ingest.report.run import RunReport, UsedManifest
 from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
@@ -338,7 +338,7 @@ def run(
     if report is None:
         recordings = tuple(executor.map(tasks if verify else mark_known(tasks), observe))
         return RunReport(tool=tool, manifests=tuple(manifests), recordings=recordings)
-    from mosaico_ingest.report.files import Header, ReportWriter
+    from mosaico_ingest.report.run import Header, ReportWriter
 
     with ReportWriter(report, Header(tool=tool, manifests=tuple(manifests)), resume=resume) as writer:
         if resume:

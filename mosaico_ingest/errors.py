@@ -19,6 +19,7 @@ IngestError
 
 from __future__ import annotations
 
+from collections.abc import Collection
 from typing import ClassVar
 
 from mosaico_ingest.findings import Finding, one_line
@@ -40,6 +41,8 @@ __all__ = [
     "VerificationError",
     "ViewError",
 ]
+
+_GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 
 
 class IngestError(Exception):
@@ -171,3 +174,8 @@ class Interrupted(IngestError):  # noqa: N818 - named after the condition
 def missing_library(library: str, extra: str) -> IngestError:
     """Return the error for a library that the extra `extra` of this package installs."""
     return IngestError(f"{library} is not installed", hint=f"pip install 'mosaico-ingest[{extra}]'")
+
+
+def gravest(codes: Collection[int]) -> int:
+    """Return the exit code of a run whose recordings have these exit codes."""
+    return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))

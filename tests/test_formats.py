@@ -16,7 +16,7 @@ from mosaico_ingest.destinations.store.catalog import FORMAT
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.pipeline.definition_changes import LockFile, read_lock
 from mosaico_ingest.pipeline.plan_document import read_plan
-from mosaico_ingest.report.files import read_report
+from mosaico_ingest.report.run import read_report
 from mosaico_ingest.serve.guard import Keyring
 
 

@@ -18,7 +18,7 @@ from mosaico_ingest import api
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.plan_document import PlanDocument, plan_schema, read_plan
-from mosaico_ingest.report.files import RunReport, read_report, report_schema
+from mosaico_ingest.report.run import RunReport, read_report, report_schema
 
 ROOT = Path(__file__).resolve().parents[1]
 JOB = ROOT / "configs" / "quickstart.yaml"

@@ -19,7 +19,7 @@ from mosaico_ingest import Store
 from mosaico_ingest.destinations.store import SequenceInfo, TopicInfo
 from mosaico_ingest.documents import html_table
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 ROOT = Path(__file__).resolve().parents[1]
 DRIVE = ROOT / "configs" / "quickstart" / "drive.mcap"

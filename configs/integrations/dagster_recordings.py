@@ -15,8 +15,8 @@ import dagster as dg
 from mosaico_ingest import IfExists, run
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.job.model import Job
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
+from mosaico_ingest.report.recording import Report
 
 RECORDING = "recording"
 """The check of the expectations that concern the complete recording."""

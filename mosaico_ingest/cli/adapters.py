@@ -1,9 +1,9 @@
-"""`ingest adapters`: list, show, explain, try, test and draft adapters."""
+"""`ingest adapters` and `ontology`: list, show, explain, try, test and draft adapters, and list ontology types."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from itertools import groupby
+from collections.abc import Iterator, Sequence
+from itertools import groupby, zip_longest
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -19,15 +19,14 @@ from mosaico_ingest.cli.console import (
     render_findings,
 )
 from mosaico_ingest.cli.options import STANDARD_OUTPUT, JsonOption, write_output
-from mosaico_ingest.report.units import counted
+from mosaico_ingest.display import counted, time_text
 
 if TYPE_CHECKING:
     from mosaico_ingest.adapters.adapter import AdapterSpec
     from mosaico_ingest.adapters.standalone import DefinitionFinder
-    from mosaico_ingest.services.adapters import Explained, Known, TestResult, TopicChoice
+    from mosaico_ingest.services.adapters import Explained, Known, TestResult, TopicChoice, TriedMessage
 
 adapters_app = typer.Typer(no_args_is_help=True, help="List, show, explain, try, test and draft adapters.")
-
 TypeDistroOption = Annotated[
     str | None,
     typer.Option(
@@ -44,6 +43,13 @@ MsgDirOption = Annotated[
         help="Folder with a package's .msg files. PKG defaults to the folder's name. Repeatable.",
     ),
 ]
+_MAX_ITEMS = 4
+"""Number of elements of a list that are shown."""
+_MAX_STRUCTS = 2
+"""Number of messages in a list that are shown."""
+_MAX_TEXT = 60
+"""Number of characters of a text that are shown."""
+ontology_app = typer.Typer(no_args_is_help=True, help="List ontology types and show their fields.")
 
 
 @adapters_app.command("list")
@@ -81,8 +87,8 @@ def print_adapters(adapters: Sequence[Known]) -> None:
     Terminal().print(table)
 
 
-@adapters_app.command()
-def show(
+@adapters_app.command("show")
+def show_adapter(
     adapter: Annotated[str, typer.Argument(metavar="NAME|FILE", help="An adapter's name or file.")],
 ) -> None:
     """Print an adapter's file."""
@@ -190,7 +196,6 @@ def try_messages(
     """
     from msgspec import to_builtins
 
-    from mosaico_ingest.cli.adapter_trial import print_trial
     from mosaico_ingest.services.adapters import try_adapter
 
     spec = _find(adapter)
@@ -202,19 +207,6 @@ def try_messages(
         print_trial(tried)
     if any(one.rejected for one in tried):
         raise typer.Exit(4)
-
-
-def _parameters(options: Sequence[str]) -> dict[str, bool | int | float | str | None]:
-    """Return the values of `--with NAME=VALUE`, read as YAML reads them."""
-    from mosaico_ingest.job.yaml_source import resolve_plain
-
-    parameters: dict[str, bool | int | float | str | None] = {}
-    for option in options:
-        name, equals, text = option.partition("=")
-        if not equals:
-            raise typer.BadParameter(f"{option!r} has no value; write NAME=VALUE", param_hint="--with")
-        parameters[name] = resolve_plain(text)[0]
-    return parameters
 
 
 @adapters_app.command("test")
@@ -263,19 +255,6 @@ def print_test_results(results: Sequence[TestResult]) -> None:
     if unknown:
         types = group_types(unknown)
         print_line(f"not checked against {types}: the definition is unknown; give --msg-dir", style="yellow")
-
-
-def _print_test_result(result: TestResult) -> None:
-    if result.findings:
-        console = Terminal(soft_wrap=True)
-        console.print(render_findings(result.findings, read_sources(result.findings)))
-    for outcome in result.outcomes:
-        if not outcome.passed:
-            print_line(f"{result.file}:{outcome.line}: {outcome.name}", style="red")
-            for problem in outcome.problems:
-                print_line(f"  {problem}")
-    if not result.outcomes and not result.findings:
-        print_line(f"{result.file}: has no tests", style="yellow")
 
 
 @adapters_app.command()
@@ -331,6 +310,104 @@ def init(
         print_line(f"wrote {out}; test it with `ingest adapters test {out}`")
 
 
+def print_trial(tried: Sequence[TriedMessage]) -> None:
+    """Print each message with its rows."""
+    for one in tried:
+        rows = sum(len(of_output) for of_output in one.rows.values())
+        print_line(f"message {one.index}, {time_text(one.log_time_ns)}: {counted(rows, 'row')}", style="bold")
+        table = PlainTable("message", "value", "column", "row")
+        left = list(_lines(one.message, ""))
+        right = [line for name, of_output in one.rows.items() for line in _row_lines(name, of_output)]
+        for (path, value), (column, stored) in zip_longest(left, right, fillvalue=("", "")):
+            table.add_row(Text(path, style="dim"), value, Text(column, style="dim"), stored)
+        Terminal().print(table)
+        if one.rejected is not None:
+            print_line(f"rejected {one.rejected}", style="red")
+        if one.dropped is not None:
+            print_line(f"dropped by `{one.dropped}`", style="yellow")
+    rejected = sum(one.rejected is not None for one in tried)
+    dropped = sum(one.dropped is not None for one in tried)
+    line = f"{counted(len(tried), 'message')}: {len(tried) - rejected - dropped} written"
+    print_line(f"{line}, {dropped} dropped, {rejected} rejected", style="red" if rejected else "green")
+
+
+@ontology_app.command("ls")
+def list_types(
+    tag: Annotated[
+        str | None, typer.Argument(metavar="GLOB", help="Only types whose tag matches, such as *Image.")
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """List the ontology types with the built-in adapters that produce them."""
+    from msgspec import to_builtins
+
+    from mosaico_ingest.errors import NothingMatched
+    from mosaico_ingest.services.schemas import known_ontologies
+
+    types = known_ontologies(tag)
+    if not types:
+        raise NothingMatched(
+            f"no ontology type matches {tag!r}", hint="list all types with `ingest ontology ls`"
+        )
+    if as_json:
+        print_json([to_builtins(one) for one in types])
+        return
+    table = PlainTable("tag", "fields", "description", "adapters", numbers={"fields"})
+    for one in types:
+        table.add_row(one.tag, str(one.fields), one.summary, ", ".join(one.adapters))
+    Terminal().print(table)
+
+
+@ontology_app.command("show")
+def show_type(
+    tag: Annotated[str, typer.Argument(metavar="TAG", help="The tag of an ontology type, such as IMU.")],
+    as_json: JsonOption = False,
+) -> None:
+    """Show the fields of an ontology type with their types, units, and whether they can be null."""
+    from msgspec import to_builtins
+
+    from mosaico_ingest.services.schemas import describe_ontology
+
+    described = describe_ontology(tag)
+    if as_json:
+        print_json(to_builtins(described))
+        return
+    Terminal(soft_wrap=True).print(Text.assemble((described.tag, "bold"), f": {described.summary}"))
+    print_line(f"format {described.format}, fingerprint {described.fingerprint}", style="dim")
+    table = PlainTable("field", "type", "unit", "")
+    for field in described.fields:
+        table.add_row(field.name, field.type, field.unit, "nullable" if field.nullable else "required")
+    Terminal().print(table)
+    if described.adapters:
+        print_line(f"produced by {', '.join(described.adapters)}")
+
+
+def _parameters(options: Sequence[str]) -> dict[str, bool | int | float | str | None]:
+    """Return the values of `--with NAME=VALUE`, read as YAML reads them."""
+    from mosaico_ingest.job.yaml_source import resolve_plain
+
+    parameters: dict[str, bool | int | float | str | None] = {}
+    for option in options:
+        name, equals, text = option.partition("=")
+        if not equals:
+            raise typer.BadParameter(f"{option!r} has no value; write NAME=VALUE", param_hint="--with")
+        parameters[name] = resolve_plain(text)[0]
+    return parameters
+
+
+def _print_test_result(result: TestResult) -> None:
+    if result.findings:
+        console = Terminal(soft_wrap=True)
+        console.print(render_findings(result.findings, read_sources(result.findings)))
+    for outcome in result.outcomes:
+        if not outcome.passed:
+            print_line(f"{result.file}:{outcome.line}: {outcome.name}", style="red")
+            for problem in outcome.problems:
+                print_line(f"  {problem}")
+    if not result.outcomes and not result.findings:
+        print_line(f"{result.file}: has no tests", style="yellow")
+
+
 def _find(adapter: str) -> AdapterSpec:
     from mosaico_ingest.services.adapters import find_adapter
 
@@ -371,3 +448,37 @@ def _result_json(result: TestResult) -> dict[str, Any]:
             for outcome in result.outcomes
         ],
     }
+
+
+def _row_lines(output: str, rows: Sequence[dict[str, Any]]) -> Iterator[tuple[str, str]]:
+    for number, row in enumerate(rows):
+        title = f"{output} {number + 1}".strip() if output or len(rows) > 1 else ""
+        if title:
+            yield f"{title}:", ""
+        yield from _lines(row, "  " if title else "")
+
+
+def _lines(values: dict[str, Any], prefix: str) -> Iterator[tuple[str, str]]:
+    """Yield the path and the value of each field; long lists and texts are shortened."""
+    for name, value in values.items():
+        if isinstance(value, dict):
+            yield from _lines(value, f"{prefix}{name}.")
+        elif isinstance(value, list) and value and isinstance(value[0], dict):
+            for at, item in enumerate(value[:_MAX_STRUCTS]):
+                yield from _lines(item or {}, f"{prefix}{name}[{at}].")
+            if len(value) > _MAX_STRUCTS:
+                yield f"{prefix}{name}", f"… {len(value)} elements"
+        else:
+            yield f"{prefix}{name}", _text(value)
+
+
+def _text(value: Any) -> str:  # noqa: ANN401 - a value of a message or row
+    if isinstance(value, bytes):
+        return f"{len(value)} bytes"
+    if isinstance(value, list):
+        items = ", ".join(_text(item) for item in value[:_MAX_ITEMS])
+        return f"[{items}]" if len(value) <= _MAX_ITEMS else f"[{items}, … {len(value)} elements]"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    text = "null" if value is None else str(value)
+    return text if len(text) <= _MAX_TEXT else f"{text[:_MAX_TEXT]}…"

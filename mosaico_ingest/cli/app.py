@@ -1,4 +1,4 @@
-"""The `ingest` command: its subcommands, and the exit codes of errors."""
+"""The `ingest` command: its subcommands, the exit codes of errors, and shell completion."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import io
 import os
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from difflib import get_close_matches
 from importlib import import_module
 from pathlib import Path
@@ -15,24 +15,24 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperArgument, TyperCommand, TyperGroup
 
-from mosaico_ingest.cli.completion import completer
 from mosaico_ingest.cli.process import defer_garbage_collection
 from mosaico_ingest.errors import IngestError, Interrupted
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.version import __version__
 
 COMMANDS = {
-    "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "check": "check", "diff": "plan", "init": "plan",
-    "expand": "plan", "view": "view", "verify": "store", "replay": "run", "export": "export", "lint": "lint", "serve": "serve", "browse": "pages", "watch": "watch",
-    "status": "watch", "report": "report", "quickstart": "quickstart",
+    "run": "run", "bag": "run", "inspect": "report", "plan": "plan", "check": "check", "diff": "plan",
+    "init": "manifests", "expand": "manifests", "view": "export", "verify": "store", "replay": "run", "export": "export",
+    "lint": "check", "serve": "serve", "browse": "serve", "watch": "serve", "status": "serve", "report": "report",
+    "quickstart": "manifests",
 }  # fmt: skip
 """The module in `cli` that defines each command, in the order of `--help`."""
 GROUPS = {
     "adapters": "adapters",
-    "ontology": "ontology",
+    "ontology": "adapters",
     "store": "store",
     "keys": "serve",
-    "schema": "schema",
+    "schema": "manifests",
 }
 """The module in `cli` that defines each command group, as the Typer application `<name>_app`."""
 GROUP_HELP = {
@@ -48,6 +48,8 @@ NAMES = (*COMMANDS, *GROUPS)
 COMPLETING = "_INGEST_COMPLETE" in os.environ
 """Whether a shell asks for completions."""
 MANIFEST_SUFFIXES = (".yaml", ".yml")
+MAX_NAMES = 500
+"""Maximum number of proposals."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -83,29 +85,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(IngestError.exit_code)
 
 
-def _suggest() -> bool:
-    """Print commands for the recordings and manifests of the current folder; return whether there are any."""
-    from mosaico_ingest.cli.quickstart import suggestions
-
-    lines = suggestions(Path())
-    if lines:
-        typer.echo("\n".join(["This folder contains", *lines, "All commands: ingest --help"]))
-    return bool(lines)
-
-
-def _invoke(words: list[str]) -> None:
-    if not words and not COMPLETING and _suggest():
-        sys.exit(2)
-    try:
-        lists_only = not COMPLETING and words in ([], ["--help"], ["-h"])
-        names = words[:1] if words and words[0] in NAMES else NAMES
-        command_line(names, lists_only=lists_only)(words, prog_name="ingest")
-    except SystemExit as error:
-        if isinstance(error.__context__, BrokenPipeError):  # typer exits with 1 in this case
-            raise error.__context__ from None
-        raise
-
-
 def command_line(names: Sequence[str] = NAMES, *, lists_only: bool = False) -> typer.Typer:
     """Return the command line with these commands, which take 40 ms to import and inspect.
 
@@ -132,6 +111,64 @@ def command_line(names: Sequence[str] = NAMES, *, lists_only: bool = False) -> t
             module = import_module(f"{__package__}.{COMMANDS[name]}")
             app.command(name, cls=_Command)(getattr(module, name))
     return app
+
+
+def _print_version(value: bool) -> None:
+    if value:
+        typer.echo(f"mosaico-ingest {__version__}")
+        raise typer.Exit
+
+
+def root(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
+    ] = False,
+    debug: Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")] = False,
+    no_python: Annotated[
+        bool,
+        typer.Option("--no-python", envvar=NO_PYTHON, show_envvar=True, help="Refuse adapters in Python."),
+    ] = False,
+) -> None:
+    """Turn ROS recordings into typed, queryable sequences. `ingest job.yaml` runs a job."""
+
+
+def completer(metavar: str | None) -> Callable[[Any, Any, str], list[str]] | None:
+    """Return the function that completes values with this metavar, or None."""
+    source = _SOURCES.get(metavar or "")
+    if source is None:
+        return None
+
+    def complete(context: Any, _parameter: Any, incomplete: str) -> list[str]:  # noqa: ANN401 - classes of typer or click
+        try:
+            names = source(str(context.params.get("store") or "mosaico"), incomplete)
+            return sorted(name for name in names if name.startswith(incomplete))[:MAX_NAMES]
+        except (IngestError, OSError):
+            return []  # without a store there is nothing to propose
+
+    return complete
+
+
+def _suggest() -> bool:
+    """Print commands for the recordings and manifests of the current folder; return whether there are any."""
+    from mosaico_ingest.cli.manifests import suggestions
+
+    lines = suggestions(Path())
+    if lines:
+        typer.echo("\n".join(["This folder contains", *lines, "All commands: ingest --help"]))
+    return bool(lines)
+
+
+def _invoke(words: list[str]) -> None:
+    if not words and not COMPLETING and _suggest():
+        sys.exit(2)
+    try:
+        lists_only = not COMPLETING and words in ([], ["--help"], ["-h"])
+        names = words[:1] if words and words[0] in NAMES else NAMES
+        command_line(names, lists_only=lists_only)(words, prog_name="ingest")
+    except SystemExit as error:
+        if isinstance(error.__context__, BrokenPipeError):  # typer exits with 1 in this case
+            raise error.__context__ from None
+        raise
 
 
 class _Command(TyperCommand):
@@ -163,25 +200,6 @@ def _without_types(parameters: Sequence[Any]) -> list[Any]:
 
 def _no_type(ctx: object) -> None:
     """Return no text for the column of types."""
-
-
-def _print_version(value: bool) -> None:
-    if value:
-        typer.echo(f"mosaico-ingest {__version__}")
-        raise typer.Exit
-
-
-def root(
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
-    debug: Annotated[bool, typer.Option("--debug", help="Print the traceback of an error.")] = False,
-    no_python: Annotated[
-        bool,
-        typer.Option("--no-python", envvar=NO_PYTHON, show_envvar=True, help="Refuse adapters in Python."),
-    ] = False,
-) -> None:
-    """Turn ROS recordings into typed, queryable sequences. `ingest job.yaml` runs a job."""
 
 
 def _add_command(words: list[str]) -> list[str]:
@@ -217,6 +235,61 @@ def _print_error(error: IngestError) -> None:
     from mosaico_ingest.cli.console import print_error
 
     print_error(str(error), error.findings)
+
+
+def _distros(_store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.job.values import Stores
+
+    return (each.value for each in Stores if each.value.startswith("ros"))
+
+
+def _sequences(store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.destinations.store import Store
+
+    return Store.open(store, create=False).names()
+
+
+def _topics(store: str, incomplete: str) -> Iterable[str]:
+    """Return the sequences, followed by a slash, or the topics of the sequence before the slash."""
+    from mosaico_ingest.destinations.store import Store
+
+    opened = Store.open(store, create=False)
+    sequence, slash, _ = incomplete.partition("/")
+    if not slash:
+        return (f"{name}/" for name in opened.names())
+    return (f"{sequence}{topic.name}" for topic in opened.sequence(sequence).topics)
+
+
+def _adapters(_store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.adapters.builtin import BY_NAME
+
+    return BY_NAME
+
+
+def _tags(_store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.ontology.registry import tags
+
+    return tags()
+
+
+def _rules(_store: str, _incomplete: str) -> Iterable[str]:
+    from mosaico_ingest.rules import RULES
+
+    return (*RULES, "all")
+
+
+_SOURCES: dict[str, Callable[[str, str], Iterable[str]]] = {
+    "DISTRO": _distros,
+    "SEQUENCE": _sequences,
+    "JOB.yaml|SEQUENCE": _sequences,
+    "SEQUENCE/TOPIC": _topics,
+    "SEQUENCE[/TOPIC]": _topics,
+    "NAME|FILE": _adapters,
+    "NAME|TYPE|FILE": _adapters,
+    "TAG": _tags,
+    "RULE": _rules,
+}
+"""The proposals by metavar; the arguments are the store and the incomplete word."""
 
 
 if __name__ == "__main__":

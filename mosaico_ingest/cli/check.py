@@ -1,21 +1,30 @@
-"""`ingest check`."""
+"""`ingest check` and `lint`, and the results of `run`, `plan` and `check` as JUnit XML and SARIF."""
 
 from __future__ import annotations
 
+import os
+import sys
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterable, Iterator, Sequence
+from enum import Enum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from msgspec import Struct
 from rich.text import Text
 
 from mosaico_ingest.cli.console import Terminal, print_json, print_line, read_sources, render_findings
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, JunitOption, SarifOption, write_output
-from mosaico_ingest.report.units import counted
+from mosaico_ingest.display import counted
+from mosaico_ingest.findings import Finding, Severity, join_names, nearest
 
 if TYPE_CHECKING:
-    from mosaico_ingest.report.contract import ContractResult
+    from mosaico_ingest.lint.engine import LintReport
+    from mosaico_ingest.lint.formats import Case, Suite
+    from mosaico_ingest.pipeline.plan_document import RecordingPlan
+    from mosaico_ingest.report.parts import ContractResult, ExpectationResult
+    from mosaico_ingest.report.run import RunReport
     from mosaico_ingest.services.check import Checked
 
 
@@ -66,8 +75,8 @@ def check(
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
+    from mosaico_ingest.errors import gravest
     from mosaico_ingest.pipeline.contract_check import needs_times_only
-    from mosaico_ingest.report.files import gravest
 
     collect_garbage_as_usual()
     if expect is None and store is not None:
@@ -90,7 +99,7 @@ def check(
     if junit is not None or sarif is not None:
         _write_ci_files(checked, junit, sarif)
     if metrics is not None:
-        from mosaico_ingest.report.metrics import contract_metrics
+        from mosaico_ingest.report.summaries import contract_metrics
 
         write_output(metrics, contract_metrics([one.contract for one in checked if one.contract is not None]))
     code = gravest([one.exit_code for one in checked])
@@ -98,12 +107,112 @@ def check(
         raise typer.Exit(code)
 
 
-def _write_ci_files(checked: Sequence[Checked], junit: Path | None, sarif: Path | None) -> None:
-    from mosaico_ingest.cli.ci import (  # the formats of lint take 30 ms to import
-        CheckedRecording,
-        write_ci_files,
-    )
+class CheckedRecording(Struct, frozen=True):
+    """The outcome of one recording: the results of its contract, and the error that ended its run."""
 
+    name: str
+    """The name of the sequence or of the check."""
+    contract: ContractResult | None = None
+    error: str | None = None
+    findings: tuple[Finding, ...] = ()
+    """The findings of the error."""
+
+
+def write_ci_files(recordings: Sequence[CheckedRecording], *, junit: Path | None, sarif: Path | None) -> None:
+    """Write the files of `--junit` and `--sarif`.
+
+    Raises:
+        SinkError: A file cannot be written.
+    """
+    from mosaico_ingest.lint.formats import junit_text, sarif_text  # take 30 ms to import
+
+    if junit is not None:
+        write_output(junit, junit_text(map(_suite, recordings)))
+    if sarif is not None:
+        findings = dict.fromkeys(finding for one in recordings for finding in _findings(one))
+        write_output(sarif, sarif_text(tuple(findings)))
+
+
+def run_outcomes(report: RunReport) -> list[CheckedRecording]:
+    """Return the outcome of each recording of a run."""
+    return [
+        CheckedRecording(
+            recording.sequence,
+            recording.contract,
+            recording.error,
+            tuple(each.finding for each in recording.error_findings),
+        )
+        for recording in report.recordings
+    ]
+
+
+def plan_outcomes(recordings: Sequence[RecordingPlan]) -> list[CheckedRecording]:
+    """Return the outcome of each planned recording: what the index and the sample reveal about its contract."""
+    return [
+        CheckedRecording(recording.plan["sequence"]["name"], recording.contract) for recording in recordings
+    ]
+
+
+class OutputFormat(str, Enum):
+    """Formats of findings."""
+
+    TEXT = "text"
+    JSON = "json"
+    SARIF = "sarif"
+    GITHUB = "github"
+    JUNIT = "junit"
+
+
+def lint(
+    paths: Annotated[
+        list[str] | None,
+        typer.Argument(
+            metavar="FILE|DIR|-", help="Files to check; folders include their subfolders, - reads stdin."
+        ),
+    ] = None,
+    *,
+    output_format: Annotated[
+        OutputFormat, typer.Option("--format", help="Format of the findings.")
+    ] = OutputFormat.TEXT,
+    fix: Annotated[bool, typer.Option("--fix", help="Apply the fixes that are safe.")] = False,
+    no_env: Annotated[
+        bool, typer.Option("--no-env", help="Do not report unset environment variables.")
+    ] = False,
+    explain: Annotated[
+        str | None,
+        typer.Option("--explain", help="Print the page of a rule, or `all` rules.", metavar="RULE"),
+    ] = None,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print findings only.")] = False,
+) -> None:
+    """Check job manifests, adapter files and .msg files without opening any recording.
+
+    Exit codes: 0 no findings, 1 a file cannot be read or written, 2 usage, 3 no file to check, 10 infos,
+    11 warnings, 12 errors. With --format sarif, findings exit with 0.
+    """
+    from mosaico_ingest.cli.process import collect_garbage_as_usual
+    from mosaico_ingest.lint.engine import STDIN, lint_paths
+    from mosaico_ingest.lint.formats import FORMATS
+
+    collect_garbage_as_usual()
+    if explain is not None:
+        typer.echo(_explanation(explain), nl=False)
+        return
+    if not paths:
+        raise typer.BadParameter("give a file or a folder", param_hint="FILE|DIR|-")
+    missing = [path for path in paths if path != STDIN and not Path(path).exists()]
+    if missing:
+        raise typer.BadParameter(f"{missing[0]} does not exist", param_hint="FILE|DIR|-")
+    stdin = sys.stdin.read() if STDIN in paths else None
+    report = lint_paths(paths, env=None if no_env else os.environ, fix=fix, stdin=stdin)
+    if output_format is OutputFormat.TEXT:
+        _print_text(report, quiet=quiet)
+    else:
+        typer.echo(FORMATS[output_format.value](report), nl=False)
+    if report.exit_code and (output_format is not OutputFormat.SARIF or not report.files):
+        raise typer.Exit(report.exit_code)
+
+
+def _write_ci_files(checked: Sequence[Checked], junit: Path | None, sarif: Path | None) -> None:
     recordings = [
         CheckedRecording(one.name, one.contract, None if one.error is None else str(one.error), one.findings)
         for one in checked
@@ -128,10 +237,12 @@ def _print(one: Checked, *, show_all: bool) -> None:
     if selected:
         Terminal(soft_wrap=True).print(render_findings(selected, read_sources(selected)))
         print_line("")
-    print_line(_summary(one.name, one.contract), style="green" if one.contract.passed else "bold red")
+    print_line(
+        _contract_summary(one.name, one.contract), style="green" if one.contract.passed else "bold red"
+    )
 
 
-def _summary(name: str, contract: ContractResult) -> str:
+def _contract_summary(name: str, contract: ContractResult) -> str:
     counts = Counter(result.outcome.value for result in contract.results)
     warnings = len(contract.warnings)
     parts = [f"{counts['passed']} passed"]
@@ -151,3 +262,81 @@ def _document(one: Checked) -> dict[str, object]:
         "error": None if one.error is None else str(one.error),
         "contract": contract,
     }
+
+
+def _suite(recording: CheckedRecording) -> Suite:
+    """Return a test case for each expectation and each other finding; a recording without both is one test case."""
+    from mosaico_ingest.lint.formats import Case, Suite
+
+    results = recording.contract.results if recording.contract is not None else ()
+    cases = [_case(result, recording.name) for result in results]
+    cases += [
+        Case(f"{finding.rule}: {finding.message}", recording.name, failure=finding, span=finding.span)
+        for finding in _other_findings(recording)
+    ]
+    return Suite(recording.name, tuple(cases) or (Case("ingest", recording.name),))
+
+
+def _case(result: ExpectationResult, recording: str) -> Case:
+    from mosaico_ingest.lint.formats import Case
+    from mosaico_ingest.report.parts import Outcome
+
+    topic = f" {result.topic}" if result.topic and result.topic not in result.expectation else ""
+    span = None if result.location is None else result.location.span
+    failure = result.finding if result.outcome is Outcome.FAILED else None
+    skipped = result.text if result.outcome is Outcome.SKIPPED else None
+    return Case(f"{result.expectation}{topic}", recording, failure=failure, skipped=skipped, span=span)
+
+
+def _findings(recording: CheckedRecording) -> Iterator[Finding]:
+    results = recording.contract.results if recording.contract is not None else ()
+    yield from (finding for result in results if (finding := result.finding) is not None)
+    yield from _other_findings(recording)
+
+
+def _other_findings(recording: CheckedRecording) -> Iterable[Finding]:
+    """Return the findings of the error that are not results of the contract, or the error itself if it has none."""
+    has_results = recording.contract is not None
+    others = [one for one in recording.findings if not has_results or one.rule != "expectation-failed"]
+    if others or recording.error is None or recording.findings:
+        return others
+    return [Finding("run-failed", Severity.ERROR, recording.error)]
+
+
+def _print_text(report: LintReport, *, quiet: bool) -> None:
+    if report.findings:
+        # The texts of the report are those after fixes, and that of standard input.
+        sources = {**read_sources(report.findings), **{file.file: file.text for file in report.files}}
+        Terminal(soft_wrap=True).print(render_findings(report.findings, sources))
+    if not quiet:
+        for line in _lint_summary(report).splitlines():
+            print_line(line, style="bold", stderr=True)
+
+
+def _lint_summary(report: LintReport) -> str:
+    """Return the number of files, findings and applied fixes, and a line about skipped files."""
+    summary = "nothing to check: no manifest, adapter or .msg file"
+    if report.files:
+        summary = f"{counted(len(report.files), 'file')}, {counted(len(report.findings), 'finding')}"
+    fixes = sum(file.fixed for file in report.files)
+    if fixes:
+        summary += f", {counted(fixes, 'change')} made"
+    if report.skipped:
+        names = join_names(skipped.file for skipped in report.skipped)
+        skipped = counted(len(report.skipped), "file")
+        summary += f"\n{skipped} skipped (not a manifest or an adapter): {names}"
+    return summary
+
+
+def _explanation(name: str) -> str:
+    from mosaico_ingest.lint.pages import page_of, rule_index
+    from mosaico_ingest.rules import RULES, find_rule
+
+    if name == "all":
+        return rule_index()
+    rule = find_rule(name)
+    if rule is None:
+        close = nearest(name, RULES)
+        hint = f"; did you mean {close!r}?" if close else "; list the rules with `--explain all`"
+        raise typer.BadParameter(f"there is no rule {name!r}{hint}", param_hint="--explain")
+    return page_of(rule)

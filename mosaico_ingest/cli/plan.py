@@ -1,4 +1,4 @@
-"""`ingest plan`, `diff`, `expand` and `init`."""
+"""`ingest plan` and `diff`."""
 
 from __future__ import annotations
 
@@ -13,21 +13,18 @@ from rich.text import Text
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import (
     STANDARD_OUTPUT,
-    DistroOption,
-    ForceOption,
     JsonOption,
     JunitOption,
     ManifestArgument,
     SarifOption,
     write_output,
 )
+from mosaico_ingest.display import bytes_text, counted, seconds_text, time_text
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import Severity, join_names
 from mosaico_ingest.remote import is_url
-from mosaico_ingest.report.units import bytes_text, counted, seconds_text, time_text
 
 if TYPE_CHECKING:
-    from mosaico_ingest.job.reference import Expanded
     from mosaico_ingest.pipeline.plan_document import (
         DestinationState,
         Difference,
@@ -105,7 +102,7 @@ def _write_ci_files(
 ) -> None:
     """Write the files of `--junit` and `--sarif`: an outcome for each planned recording, or the error of the plan."""
     if junit is not None or sarif is not None:
-        from mosaico_ingest.cli.ci import CheckedRecording, plan_outcomes, write_ci_files
+        from mosaico_ingest.cli.check import CheckedRecording, plan_outcomes, write_ci_files
 
         outcomes = plan_outcomes(recordings)
         if error is not None:
@@ -260,112 +257,3 @@ def print_differences(differences: Sequence[Difference]) -> None:
         print_line(str(difference), style=style)
     if not differences:
         print_line("the plans are equal", style="green")
-
-
-def expand(manifest: ManifestArgument, as_json: JsonOption = False) -> None:
-    """Print every job of a manifest as a separate manifest, without `extends`, `matrix` and secrets.
-
-    Environment variables are not replaced. A comment shows the location of a value from another file.
-    """
-    from mosaico_ingest.job.reference import expand_manifest, to_yaml
-
-    jobs = expand_manifest(manifest)
-    if as_json:
-        print_json([job.value for job in jobs])
-        return
-    documents = (f"{_cell_comment(manifest, job)}{to_yaml(job.value, job.remark)}" for job in jobs)
-    typer.echo("---\n".join(documents), nl=False)
-
-
-def _cell_comment(manifest: Path, job: Expanded) -> str:
-    cell = ", ".join(f"{name}={value}" for name, value in job.cell.items())
-    return f"# {manifest}: {cell}\n" if cell else ""
-
-
-def init(
-    recordings: Annotated[
-        list[str],
-        typer.Argument(
-            metavar="BAG...",
-            help="A .bag, .db3 or .mcap file, a rosbag2 directory, or a URL; with --expect also several.",
-        ),
-    ],
-    *,
-    expect: Annotated[
-        bool,
-        typer.Option(
-            "--expect", help="Draft the section `expect` instead, which all of the recordings fulfill."
-        ),
-    ] = False,
-    tolerance: Annotated[
-        float,
-        typer.Option(
-            "--tolerance",
-            min=0,
-            max=1000,
-            metavar="PERCENT",
-            help="With --expect: how far to widen the range of the recordings' values.",
-        ),
-    ] = 20,
-    out: Annotated[
-        Path | None,
-        typer.Option("--out", "-o", help="Write to this file.", metavar="FILE.yaml", show_default="stdout"),
-    ] = None,
-    ros_distro: DistroOption = None,
-    force: ForceOption = False,
-) -> None:
-    """Draft a manifest for a recording: every topic with its type, count and adapter, and common options.
-
-    With --expect, draft a data contract from good recordings.
-    """
-    if out is not None and out != STANDARD_OUTPUT and out.exists() and not force:
-        raise typer.BadParameter(f"{out} exists; replace it with --force", param_hint="--out")
-    if expect:
-        _draft_contract(recordings, tolerance=tolerance, out=out, ros_distro=ros_distro)
-        return
-    if len(recordings) > 1:
-        raise typer.BadParameter("several recordings need --expect", param_hint="BAG")
-    _draft_manifest(recordings[0], out=out, ros_distro=ros_distro)
-
-
-def _draft_contract(
-    recordings: Sequence[str], *, tolerance: float, out: Path | None, ros_distro: str | None
-) -> None:
-    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
-    from mosaico_ingest.remote import as_path
-    from mosaico_ingest.services.draft_contract import draft_contract, measure_recording
-
-    collect_garbage_as_usual()
-    hide_pandas()
-    measured = [measure_recording(as_path(path), ros_distro=ros_distro) for path in recordings]
-    write_output(out or STANDARD_OUTPUT, draft_contract(measured, tolerance=tolerance))
-    if out is not None and out != STANDARD_OUTPUT:
-        topics = len({topic for one in measured for topic in one.topics})
-        print_line(
-            f"{out}: expectations of {counted(topics, 'topic')}, from {counted(len(measured), 'recording')}"
-        )
-
-
-def _draft_manifest(path: str, *, out: Path | None, ros_distro: str | None) -> None:
-    from shlex import quote
-
-    from mosaico_ingest import api
-    from mosaico_ingest.errors import NothingMatched
-    from mosaico_ingest.remote import as_path
-    from mosaico_ingest.services.inspection import draft_manifest
-
-    inspection = api.inspect_recording(path, ros_distro=ros_distro)
-    if not inspection.topics:
-        raise NothingMatched("the recording has no topics", where=path)
-    folder = out.parent if out is not None else Path()
-    text = draft_manifest(inspection, as_path(path), folder=folder, ros_distro=ros_distro)
-    count = len({topic.topic for topic in inspection.topics if topic.problem is None})
-    write_output(out or STANDARD_OUTPUT, text)
-    if out is not None and out != STANDARD_OUTPUT:
-        command = f"; run it with `ingest {quote(str(out))}`" if count else ""
-        print_line(f"{out}: {counted(count, 'topic')}{command}")
-    if not count:
-        topic = inspection.topics[0]
-        raise NothingMatched(
-            "no topic can be ingested without changes", where=path, hint=f"{topic.topic}: {topic.problem}"
-        )

@@ -1,17 +1,22 @@
-"""Settings of the process: signals, garbage collection, memory, and the import of pandas."""
+"""Settings of the process: signals, garbage collection, memory, the import of pandas, and logging."""
 
 from __future__ import annotations
 
 import gc
+import json
+import logging
 import signal
 import sys
 from collections.abc import Sequence
 from contextlib import suppress
+from datetime import datetime, timezone
+from enum import Enum
 from importlib.machinery import ModuleSpec
 from types import FrameType
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.errors import AdapterError
+from mosaico_ingest.errors import AdapterError, ManifestError
+from mosaico_ingest.findings import one_line
 from mosaico_ingest.lazy import LazySequence
 
 if TYPE_CHECKING:
@@ -22,15 +27,12 @@ IMPORT_THRESHOLD = 500_000
 """Allocations between two collections during start-up: more than all imports make."""
 M_ARENA_MAX = -8
 """glibc's parameter for the maximum number of heaps."""
+LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL")
 
 
 def interrupt_on_sigterm() -> None:
     """Treat SIGTERM like Ctrl-C, so that the session policy applies to both."""
     signal.signal(signal.SIGTERM, _interrupt)
-
-
-def _interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt
 
 
 def exit_on_signals() -> None:
@@ -76,6 +78,50 @@ def hide_pandas(jobs: Sequence[Job] = ()) -> None:
         sys.meta_path.remove(_NoPandas)
 
 
+def limit_heaps(count: int = 2) -> None:
+    """Let all threads share a few heaps, so that a server's short-lived threads do not keep one each.
+
+    On other C libraries than glibc, only the memory pool of Arrow changes.
+    """
+    import ctypes
+
+    import pyarrow as pa
+
+    pa.set_memory_pool(pa.system_memory_pool())
+    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no default library
+        ctypes.CDLL(None).mallopt(M_ARENA_MAX, count)
+
+
+class LogFormat(str, Enum):
+    """How log records and progress are written."""
+
+    TEXT = "text"
+    JSON = "json"
+
+
+def set_up_logging(level: str, log_format: LogFormat = LogFormat.TEXT) -> None:
+    """Send log records of this level and above to standard error.
+
+    Raises:
+        ManifestError: The level is unknown.
+    """
+    if level.upper() not in LEVELS:
+        raise ManifestError(f"the log level {level!r} is unknown", hint=f"use one of {', '.join(LEVELS)}")
+    handler = _StderrHandler()
+    handler.setFormatter(_JsonFormatter() if log_format is LogFormat.JSON else _TextFormatter())
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+
+
+def json_line(event: str, **values: Any) -> str:  # noqa: ANN401 - any JSON value
+    """Return a JSON object with the current time, the name of the event and its values."""
+    now = datetime.now(timezone.utc).isoformat(timespec="milliseconds")
+    return json.dumps({"time": now, "event": event, **values})
+
+
+def _interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt
+
+
 class _NoPandas:
     """An import hook that hides pandas and leaves every other module to the next hook."""
 
@@ -102,15 +148,25 @@ def _has_installed_adapters() -> bool:
         return True  # the run reports the error when it uses them
 
 
-def limit_heaps(count: int = 2) -> None:
-    """Let all threads share a few heaps, so that a server's short-lived threads do not keep one each.
+class _StderrHandler(logging.Handler):
+    """Writes to the current `sys.stderr`, which the live display replaces while it runs."""
 
-    On other C libraries than glibc, only the memory pool of Arrow changes.
-    """
-    import ctypes
+    def emit(self, record: logging.LogRecord) -> None:
+        try:
+            sys.stderr.write(self.format(record) + "\n")
+        except Exception:  # noqa: BLE001 - a record that cannot be written must not end the run
+            self.handleError(record)
 
-    import pyarrow as pa
 
-    pa.set_memory_pool(pa.system_memory_pool())
-    with suppress(OSError, AttributeError, TypeError):  # TypeError: Windows has no default library
-        ctypes.CDLL(None).mallopt(M_ARENA_MAX, count)
+class _TextFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        line = one_line(f"{record.levelname} {record.name}: {record.getMessage()}")
+        return f"{line}\n{self.formatException(record.exc_info)}" if record.exc_info else line
+
+
+class _JsonFormatter(logging.Formatter):
+    def format(self, record: logging.LogRecord) -> str:
+        values = {"level": record.levelname.lower(), "logger": record.name, "message": record.getMessage()}
+        if record.exc_info:
+            values["traceback"] = self.formatException(record.exc_info)
+        return json_line("log", **values)

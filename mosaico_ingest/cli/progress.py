@@ -15,7 +15,8 @@ from rich.progress_bar import ProgressBar
 from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal
-from mosaico_ingest.cli.logs import json_line
+from mosaico_ingest.cli.process import json_line
+from mosaico_ingest.display import bytes_text, count_text, counted, percent_text, seconds_text
 from mosaico_ingest.executors.base import source_bytes
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.events import (
@@ -30,7 +31,6 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
-from mosaico_ingest.report.units import bytes_text, count_text, counted, percent_text, seconds_text
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.model import Job

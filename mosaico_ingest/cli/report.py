@@ -11,9 +11,7 @@ from rich.text import Text
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_line
 from mosaico_ingest.cli.options import DistroOption, JsonOption, RecordingArgument, write_output
-from mosaico_ingest.findings import Stage, join_names
-from mosaico_ingest.report.events import SUCCESSFUL, RunStatus, TopicStatus
-from mosaico_ingest.report.units import (
+from mosaico_ingest.display import (
     bytes_text,
     count_text,
     counted,
@@ -22,13 +20,14 @@ from mosaico_ingest.report.units import (
     stored_text,
     time_text,
     written_cell,
-    written_text,
 )
+from mosaico_ingest.findings import Stage, join_names
+from mosaico_ingest.report.events import SUCCESSFUL, RunStatus, TopicStatus
 
 if TYPE_CHECKING:
-    from mosaico_ingest.report.compare import Comparison
-    from mosaico_ingest.report.files import RunReport
-    from mosaico_ingest.report.model import Report, TopicReport
+    from mosaico_ingest.report.recording import Report, TopicReport
+    from mosaico_ingest.report.run import RunReport
+    from mosaico_ingest.report.summaries import Comparison
     from mosaico_ingest.services.inspection import Inspection
 
 WIDE = 100
@@ -125,9 +124,8 @@ def report(
     """Show report files as tables, as an HTML page, or as a Markdown summary."""
     from mosaico_ingest.cli.process import collect_garbage_as_usual
     from mosaico_ingest.pages.run import run_page
-    from mosaico_ingest.report.compare import compare_reports
-    from mosaico_ingest.report.files import combine, read_report
-    from mosaico_ingest.report.markdown import markdown_summary
+    from mosaico_ingest.report.run import combine, read_report
+    from mosaico_ingest.report.summaries import compare_reports, markdown_summary
 
     collect_garbage_as_usual()
     reports = [read_report(path) for path in paths]
@@ -272,7 +270,7 @@ def rejection_lines(report: Report) -> Iterator[str]:
 
 def _totals(report: Report) -> Iterator[str]:
     totals = report.totals
-    yield written_text(report)
+    yield report.written_text
     if totals.rejected:
         yield f"{count_text(totals.rejected)} rejected"
     if report.unreadable_ranges:

@@ -16,7 +16,6 @@ from typing import TYPE_CHECKING, Annotated, TypeVar
 import typer
 from msgspec import Struct
 
-from mosaico_ingest.cli.logs import LogFormat, set_up_logging
 from mosaico_ingest.cli.options import (
     STANDARD_OUTPUT,
     STORE,
@@ -34,7 +33,13 @@ from mosaico_ingest.cli.options import (
     log_level,
     write_output,
 )
-from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas, interrupt_on_sigterm
+from mosaico_ingest.cli.process import (
+    LogFormat,
+    collect_garbage_as_usual,
+    hide_pandas,
+    interrupt_on_sigterm,
+    set_up_logging,
+)
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.lazy import LazySequence, concatenate
@@ -44,7 +49,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
     from mosaico_ingest.job.model import Job
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.report.files import RunReport, UsedManifest
+    from mosaico_ingest.report.run import RunReport, UsedManifest
 
 T = TypeVar("T")
 
@@ -83,12 +88,12 @@ class _ResultFiles(Struct, frozen=True):
 
     def write(self, report: RunReport) -> None:
         """Write the files."""
-        from mosaico_ingest.report.metrics import prometheus_text
+        from mosaico_ingest.report.summaries import prometheus_text
 
         if self.metrics is not None:
             write_output(self.metrics, prometheus_text(report))
         if self.junit is not None or self.sarif is not None:
-            from mosaico_ingest.cli.ci import run_outcomes, write_ci_files
+            from mosaico_ingest.cli.check import run_outcomes, write_ci_files
 
             write_ci_files(run_outcomes(report), junit=self.junit, sarif=self.sarif)
 
@@ -162,9 +167,9 @@ def run(
 ) -> None:
     """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
+    from mosaico_ingest.display import counted
     from mosaico_ingest.executors.base import choose_executor
     from mosaico_ingest.pipeline.task import Task
-    from mosaico_ingest.report.units import counted
 
     if bool(manifests) == (plan is not None):
         raise typer.BadParameter("give manifests, or a plan with --plan", param_hint="JOB.yaml")
@@ -451,7 +456,7 @@ def _streamed_report(files: Sequence[Path], recordings: int, *, resume: bool) ->
     Raises:
         typer.BadParameter: The report of an earlier run cannot be continued, because no report file is in JSON Lines.
     """
-    from mosaico_ingest.report.files import LINES_SUFFIX
+    from mosaico_ingest.report.run import LINES_SUFFIX
 
     report_file = next((file for file in files if file.suffix == LINES_SUFFIX), None)
     if resume and report_file is None:
@@ -481,7 +486,7 @@ def _write_results(
     result: RunReport, report_files: Sequence[Path], on_finish: Callable[[RunReport], None]
 ) -> Iterator[SinkError]:
     """Call `on_finish` and write the report files; yield the errors."""
-    from mosaico_ingest.report.files import report_text
+    from mosaico_ingest.report.run import report_text
 
     def write_report(file: Path) -> None:
         write_output(file, report_text(result, file))

@@ -1,22 +1,20 @@
-"""`ingest store` and `verify`."""
+"""`ingest store`: list, show, remove and compact sequences; also `verify`."""
 
 from __future__ import annotations
 
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
-from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption
-from mosaico_ingest.cli.pages import page
-from mosaico_ingest.cli.store_compact import compact
+from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption, write_output
 from mosaico_ingest.cli.store_pictures import image, plot
-from mosaico_ingest.cli.store_rows import describe, head, sample, tail
-from mosaico_ingest.cli.store_sql import sql
-from mosaico_ingest.job.values import ATTACHMENTS_KEY, PROVENANCE_KEY
-from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
+from mosaico_ingest.cli.store_rows import describe, head, sample, sql, tail
+from mosaico_ingest.display import bytes_text, count_text, counted, seconds_text, time_text
+from mosaico_ingest.job.values import ATTACHMENTS_KEY, PROVENANCE_KEY, Compression
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -30,7 +28,6 @@ CELL_WIDTH = 28
 """Characters of a value in a table of rows."""
 METADATA_WIDTH = 100
 """Characters of a metadata value."""
-
 store_app = typer.Typer(no_args_is_help=True, help="List, show, query and remove the sequences of a store.")
 
 
@@ -91,7 +88,6 @@ def verify(
         print_line(f"{total}: all complete and intact")
 
 
-@store_app.command("ls")
 def list_sequences(
     match: Annotated[
         str | None,
@@ -143,7 +139,6 @@ def list_sequences(
         print_sequences(listing)
 
 
-@store_app.command()
 def show(
     path: Annotated[
         str, typer.Argument(metavar="SEQUENCE[/TOPIC]", help="A sequence, or one of its topics.")
@@ -182,11 +177,6 @@ def show(
         print_topic(topic_info, first_rows)
 
 
-for command in (head, tail, sample, describe, plot, image, sql, page, compact):
-    store_app.command()(command)
-
-
-@store_app.command()
 def gc(store: StoreOption = DEFAULT_STORE) -> None:
     """Remove the files of interrupted runs. Committed sequences and active runs are not affected."""
     from mosaico_ingest.destinations.store import Store
@@ -196,7 +186,6 @@ def gc(store: StoreOption = DEFAULT_STORE) -> None:
     print_line(f"removed {counts}, {bytes_text(garbage.stored_bytes)}")
 
 
-@store_app.command("rm")
 def remove(
     sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="The sequence to remove.")],
     store: StoreOption = DEFAULT_STORE,
@@ -212,6 +201,30 @@ def remove(
         typer.confirm(f"remove {sequence} ({size}) from {store}?", abort=True)
     opened.delete_sequence(sequence)
     print_line(f"removed {sequence} ({size})")
+
+
+def page(
+    sequence: Annotated[str, typer.Argument(metavar="SEQUENCE", help="The sequence to show.")],
+    store: StoreOption = DEFAULT_STORE,
+    out: Annotated[
+        Path | None,
+        typer.Option(
+            "--out",
+            metavar="FILE",
+            help="File to write; - writes to stdout.",
+            show_default="SEQUENCE.html",
+        ),
+    ] = None,
+) -> None:
+    """Write a self-contained HTML page of a sequence: pictures, tracks, plots, schema, logs and provenance."""
+    from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
+    from mosaico_ingest.destinations.store import Store
+    from mosaico_ingest.pages.sequence import sequence_page
+
+    collect_garbage_as_usual()
+    hide_pandas()
+    html = sequence_page(Store.open(store, create=False), sequence)
+    write_output(out or Path(f"{sequence}.html"), html, announce=True)
 
 
 def print_sequences(listing: Listing) -> None:
@@ -241,19 +254,6 @@ def print_sequences(listing: Listing) -> None:
         print_line(
             f"{position}; continue with --after {shlex.quote(listing.next_after)}, or list all with --limit 0"
         )
-
-
-def _metadata_filter(conditions: Iterable[str]) -> dict[str, str]:
-    """Return the conditions `KEY=VALUE` as a mapping.
-
-    Raises:
-        typer.BadParameter: A condition has no `=`.
-    """
-    pairs = [condition.partition("=") for condition in conditions]
-    for key, separator, _ in pairs:
-        if not separator or not key:
-            raise typer.BadParameter(f"{key!r} is not KEY=VALUE", param_hint="--metadata")
-    return {key: value for key, _, value in pairs}
 
 
 def print_sequence(info: SequenceInfo) -> None:
@@ -306,6 +306,94 @@ def print_topic(info: TopicInfo, first_rows: Sequence[Mapping[str, Any]]) -> Non
     for path, column_type, values in _leaf_columns(info.schema, first_rows):
         table.add_row(path, column_type, *(value_text(value, CELL_WIDTH) for value in values))
     Terminal().print(table)
+
+
+def attachment_json(info: AttachmentInfo) -> dict[str, Any]:
+    """Return an attachment as JSON."""
+    return {
+        "name": info.name,
+        "media_type": info.media_type,
+        "log_ns": info.log_ns,
+        "create_ns": info.create_ns,
+        "stored_bytes": info.stored_bytes,
+        "checksum": info.checksum,
+        "file": str(info.path),
+    }
+
+
+def compact(
+    sequences: Annotated[
+        list[str] | None, typer.Argument(metavar="SEQUENCE", help="Sequences to compact; all if omitted.")
+    ] = None,
+    compression: Annotated[
+        Compression, typer.Option("--compression", help="Compression of the merged files.")
+    ] = Compression.FAST,
+    store: StoreOption = DEFAULT_STORE,
+    as_json: JsonOption = False,
+) -> None:
+    """Merge the small files of sequences that many sessions wrote. Readers and writers can continue meanwhile.
+
+    The replaced files stay for programs that opened them earlier; `ingest store gc` removes them. Incomplete
+    sequences stay unchanged.
+
+    Exit codes: 0 done, 5 a file is damaged.
+    """
+    from mosaico_ingest.destinations.store import Store
+    from mosaico_ingest.destinations.store.compaction import compact as compact_sequence
+    from mosaico_ingest.errors import VerificationError
+
+    opened = Store.open(store, create=False)
+    results: list[dict[str, object]] = []
+    replaced, damaged = 0, 0
+    for name in sequences or opened.names():
+        info = opened.sequence(name) if sequences else opened.find_sequence(name)
+        if info is None or info.incomplete is not None:
+            continue
+        for result in compact_sequence(opened, info, compression=compression):
+            where = f"{name}{result.topic}"
+            results.append(
+                {
+                    "sequence": name,
+                    "topic": result.topic,
+                    "files": result.segments,
+                    "bytes_before": result.bytes_before,
+                    "bytes_after": result.bytes_after,
+                    "problem": result.problem,
+                }
+            )
+            if result.problem is not None:
+                damaged += result.is_damaged
+                print_line(f"{where}: not compacted: {result.problem}", stderr=True)
+                continue
+            replaced += result.segments
+            if not as_json:
+                sizes = f"{bytes_text(result.bytes_before)} -> {bytes_text(result.bytes_after)}"
+                print_line(f"{where}: {result.segments} files -> 1, {sizes}")
+    if as_json:
+        print_json(results)
+    elif replaced:
+        print_line(f"`ingest store gc` removes the {counted(replaced, 'replaced file')}")
+    else:
+        print_line("nothing to compact")
+    if damaged:
+        raise VerificationError(
+            f"damaged: {counted(damaged, 'run')} of files",
+            where=store,
+            hint="run `ingest verify`, and ingest their recordings again with if_exists: replace",
+        )
+
+
+def _metadata_filter(conditions: Iterable[str]) -> dict[str, str]:
+    """Return the conditions `KEY=VALUE` as a mapping.
+
+    Raises:
+        typer.BadParameter: A condition has no `=`.
+    """
+    pairs = [condition.partition("=") for condition in conditions]
+    for key, separator, _ in pairs:
+        if not separator or not key:
+            raise typer.BadParameter(f"{key!r} is not KEY=VALUE", param_hint="--metadata")
+    return {key: value for key, _, value in pairs}
 
 
 def _leaf_columns(
@@ -366,19 +454,6 @@ def _summary_json(summary: SequenceSummary) -> dict[str, Any]:
     }
 
 
-def attachment_json(info: AttachmentInfo) -> dict[str, Any]:
-    """Return an attachment as JSON."""
-    return {
-        "name": info.name,
-        "media_type": info.media_type,
-        "log_ns": info.log_ns,
-        "create_ns": info.create_ns,
-        "stored_bytes": info.stored_bytes,
-        "checksum": info.checksum,
-        "file": str(info.path),
-    }
-
-
 def _topic_json(info: TopicInfo) -> dict[str, Any]:
     return {
         "sequence": info.sequence,
@@ -393,3 +468,11 @@ def _topic_json(info: TopicInfo) -> dict[str, Any]:
         "files": [str(segment.path) for segment in info.segments],
         "schema": {field.name: str(field.type) for field in info.schema},
     }
+
+
+_COMMANDS = {
+    "ls": list_sequences, "show": show, "head": head, "tail": tail, "sample": sample, "describe": describe, "plot": plot,
+    "image": image, "sql": sql, "page": page, "compact": compact, "gc": gc, "rm": remove,
+}  # fmt: skip
+for _name, _command in _COMMANDS.items():
+    store_app.command(_name)(_command)

@@ -11,7 +11,7 @@ from rich.text import Text
 from mosaico_ingest.cli.console import Terminal, print_line
 from mosaico_ingest.cli.options import DEFAULT_STORE, StoreOption
 from mosaico_ingest.cli.store_rows import TopicArgument, open_topic, time_option
-from mosaico_ingest.report.units import seconds_text
+from mosaico_ingest.display import seconds_text
 
 if TYPE_CHECKING:
     import numpy as np

@@ -1,5 +1,5 @@
 """Data contracts: evaluates the section `expect` of a job.
 
 The input is a plan's topics and the columns of their messages, batch by batch; the output is a `ContractResult`
-(`report.contract`). The package must not depend on pipelines, executors or the command line.
+(`report.parts`). The package must not depend on pipelines, executors or the command line.
 """

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from msgspec import Struct
 
+from mosaico_ingest.display import count_text
 from mosaico_ingest.findings import Severity, Span, one_line
 from mosaico_ingest.job.expect import (
     AllowedNames,
@@ -24,8 +25,7 @@ from mosaico_ingest.job.expect import (
 )
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Limit, TimeBound, format_time
-from mosaico_ingest.report.contract import ExpectationResult, Location, Occurrence, Outcome
-from mosaico_ingest.report.units import count_text
+from mosaico_ingest.report.parts import ExpectationResult, Location, Occurrence, Outcome
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
 
 if TYPE_CHECKING:

@@ -28,10 +28,9 @@ from mosaico_ingest.contracts.clauses import (
 )
 from mosaico_ingest.contracts.row_results import field_result, header_result
 from mosaico_ingest.contracts.times import FileOrder, Gaps, RecorderEvents, Windows, covered_ns, uncovered_ns
+from mosaico_ingest.display import count_text, counted, mean_rate_hz
 from mosaico_ingest.job.values import RECORDING, Limit
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
-from mosaico_ingest.report.timing import mean_rate_hz
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 
 if TYPE_CHECKING:
     from mosaico_ingest.contracts.monitor import TopicMonitor

@@ -15,9 +15,9 @@ from mosaico_ingest.contracts.clauses import ORDER_KEYS, ROW_KEYS, Clause, Contr
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
 from mosaico_ingest.contracts.times import FileOrder, Gaps, Int64s, SlidingWindow, TopicTimes, read_events
 from mosaico_ingest.contracts.values import Batch
+from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.job.values import RECORDING, Interval, OnFailure
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.rosbag.blocks import ChunkChecksum, Connection
 from mosaico_ingest.rosbag.recording import Recording
 

@@ -29,9 +29,9 @@ from mosaico_ingest.contracts.values import (
     Violation,
     Violations,
 )
+from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.job.values import Limit
-from mosaico_ingest.report.contract import ExpectationResult, Occurrence
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.parts import ExpectationResult, Occurrence
 
 if TYPE_CHECKING:
     from mosaico_ingest.contracts.rows import FieldCheck, RowMonitor

@@ -22,7 +22,7 @@ from mosaico_ingest.contracts.values import Batch
 from mosaico_ingest.destinations.store import Store, TopicInfo
 from mosaico_ingest.errors import AdapterError, BagError
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Embedded
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

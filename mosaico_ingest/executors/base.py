@@ -22,7 +22,7 @@ from mosaico_ingest.job.values import Stores
 from mosaico_ingest.pipeline.run import failed_report, run_group, run_recording
 from mosaico_ingest.pipeline.task import Attempt, Task
 from mosaico_ingest.report.events import BatchObserver, Event, RunStatus
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.rosbag.definitions.registry import Registered, ROSTypeRegistry
 
 if TYPE_CHECKING:

@@ -26,7 +26,7 @@ from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.run import failed_report
 from mosaico_ingest.pipeline.task import MemoryBudget, Task
 from mosaico_ingest.report.events import BatchObserver, Event
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 
 ATTEMPTS = 2
 """Number of times a recording is started if its worker process dies."""

@@ -36,7 +36,7 @@ from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.pipeline.task import DEFAULT_BYTES, Task
 from mosaico_ingest.remote import is_url
 from mosaico_ingest.report.events import BatchObserver, Event, RunFinished, RunStarted
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.rosbag.definitions.registry import definition_files
 
 try:

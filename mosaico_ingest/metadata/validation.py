@@ -15,6 +15,7 @@ from urllib.parse import unquote, urldefrag, urljoin, urlsplit
 from msgspec import Struct
 from msgspec.structs import replace
 
+from mosaico_ingest.display import counted
 from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import ContractError, ManifestError
 from mosaico_ingest.findings import Edit, Finding, Severity, Span, nearest
@@ -23,7 +24,6 @@ from mosaico_ingest.job.validation import key_path_text
 from mosaico_ingest.job.values import first_match
 from mosaico_ingest.job.yaml_source import KeyPath, Source, load_source, resolve_plain
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.report.units import counted
 
 if TYPE_CHECKING:
     from jsonschema import FormatChecker

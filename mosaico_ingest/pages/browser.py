@@ -1,4 +1,4 @@
-"""A web server for one user on the same machine: searchable lists of the sequences and runs of a store, and their pages.
+"""Local web server of the pages of sequences and runs, and the folder of its reports.
 
 The server listens on the loopback address only. It accepts requests whose `Host` is that address, so that a web site cannot
 read the store through a name of its own (DNS rebinding). Names are looked up in the catalog and are never used as paths.
@@ -9,6 +9,7 @@ from __future__ import annotations
 import threading
 from collections import OrderedDict
 from collections.abc import Callable
+from datetime import datetime
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
@@ -21,12 +22,15 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.pages.design import render
-from mosaico_ingest.pages.reports import ReportFolder
-from mosaico_ingest.pages.run import run_page
+from mosaico_ingest.pages.run import Verdict, run_page, verdict_of
 from mosaico_ingest.pages.sequence import sequence_page
-from mosaico_ingest.report.files import read_report
+from mosaico_ingest.report.run import LINES_SUFFIX, read_report
 from mosaico_ingest.version import __version__
 
+MAX_RUNS = 200
+"""Number of report files that are listed, the newest first."""
+Signature = tuple[int, int]
+"""Time of the last change in ns and size of a file."""
 HOST = "127.0.0.1"
 PAGE_SIZE = 50
 """Sequences on one page of the list."""
@@ -53,6 +57,61 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cache-Control": "no-store",
 }
+
+
+class RunSummary(Struct, frozen=True):
+    """One report file in the list."""
+
+    name: str
+    """The name of the file."""
+    started_at: datetime | None = None
+    verdict: Verdict | None = None
+    written: int = 0
+    """Number of written messages."""
+    sequences: tuple[str, ...] = ()
+    problem: str | None = None
+    """The reason why the file cannot be read."""
+
+
+class ReportFolder:
+    """The files `*.json` and `*.jsonl` of a folder; a file is read again only if it changes."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._summaries: dict[str, tuple[Signature, RunSummary]] = {}
+
+    def find(self, name: str) -> tuple[Path, Signature] | None:
+        """Return a file of the folder by its name, which may come from anyone, with its signature."""
+        return next(((path, signature) for path, signature in self._files() if path.name == name), None)
+
+    def summaries(self, text: str = "") -> list[RunSummary]:
+        """Return the newest runs whose name, or the name of one of their sequences, contains a text."""
+        summaries = {
+            path.name: self._summary(path, signature) for path, signature in self._files()[:MAX_RUNS]
+        }
+        needle = text.casefold()
+        return [
+            each
+            for each in summaries.values()
+            if any(needle in name.casefold() for name in (each.name, *each.sequences))
+        ]
+
+    def _files(self) -> list[tuple[Path, Signature]]:
+        """Return the files, the newest first."""
+        files: list[tuple[Path, Signature]] = []
+        for path in (*self.path.glob("*.json"), *self.path.glob(f"*{LINES_SUFFIX}")):
+            try:
+                state = path.stat()
+            except OSError:  # deleted since it was listed
+                continue
+            files.append((path, (state.st_mtime_ns, state.st_size)))
+        return sorted(files, key=lambda file: file[1], reverse=True)
+
+    def _summary(self, path: Path, signature: Signature) -> RunSummary:
+        cached = self._summaries.get(path.name)
+        if cached is None or cached[0] != signature:
+            cached = self._summaries[path.name] = (signature, _summary(path))
+        return cached[1]
 
 
 class Page(Struct, frozen=True):
@@ -183,17 +242,6 @@ def name_glob(text: str) -> str:
     return f"*{''.join(_either_case(character) for character in text)}*"
 
 
-def _either_case(character: str) -> str:
-    if character == "[":
-        return "[[]"
-    lower, upper = character.lower(), character.upper()
-    return f"[{lower}{upper}]" if lower != upper and len(lower) == len(upper) == 1 else character
-
-
-def _problem(status: HTTPStatus, title: str, text: str) -> Page:
-    return Page(status, render("problem.html", title=title, text=text))
-
-
 class BrowserServer:
     """The web server of a store; `serve_forever` returns after `close`."""
 
@@ -227,6 +275,31 @@ class BrowserServer:
     def shutdown(self) -> None:
         """Let `serve_forever` return; it must run in another thread."""
         self._server.shutdown()
+
+
+def _summary(path: Path) -> RunSummary:
+    try:
+        report = read_report(path)
+    except IngestError as error:
+        return RunSummary(path.name, problem=str(error))
+    return RunSummary(
+        path.name,
+        report.summary.started_at,
+        verdict_of(report.recordings),
+        report.summary.written,
+        tuple(dict.fromkeys(each.sequence for each in report.recordings)),
+    )
+
+
+def _either_case(character: str) -> str:
+    if character == "[":
+        return "[[]"
+    lower, upper = character.lower(), character.upper()
+    return f"[{lower}{upper}]" if lower != upper and len(lower) == len(upper) == 1 else character
+
+
+def _problem(status: HTTPStatus, title: str, text: str) -> Page:
+    return Page(status, render("problem.html", title=title, text=text))
 
 
 class _Server(ThreadingHTTPServer):

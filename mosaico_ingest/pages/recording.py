@@ -11,15 +11,7 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.errors import IngestError
-from mosaico_ingest.job.values import LoaderErrorPolicy
-from mosaico_ingest.pages.timeline import Axis, Span, Track, draw_track, optional_span, time_axis
-from mosaico_ingest.report.collect import STEP_WORDS, longest_step, step_seconds
-from mosaico_ingest.report.contract import ExpectationResult, Outcome
-from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.files import RunReport, replay_command
-from mosaico_ingest.report.model import Report, TopicReport, folder_link
-from mosaico_ingest.report.units import (
+from mosaico_ingest.display import (
     bytes_text,
     count_text,
     counted,
@@ -27,9 +19,22 @@ from mosaico_ingest.report.units import (
     rate_text,
     stored_text,
     time_text,
-    unreadable_text,
-    written_text,
 )
+from mosaico_ingest.errors import IngestError
+from mosaico_ingest.job.values import LoaderErrorPolicy
+from mosaico_ingest.pages.design import Axis, Span, Track, draw_track, optional_span, time_axis
+from mosaico_ingest.report.events import RunStatus, TopicStatus
+from mosaico_ingest.report.parts import ExpectationResult, Outcome
+from mosaico_ingest.report.recording import (
+    STEP_WORDS,
+    Report,
+    TopicReport,
+    folder_link,
+    longest_step,
+    step_seconds,
+    unreadable_text,
+)
+from mosaico_ingest.report.run import RunReport, replay_command
 
 FAILED = {RunStatus.FAILED, RunStatus.INTERRUPTED}
 STATUS_WORDS = {
@@ -161,7 +166,7 @@ class RecordingView:
             2 if report.status in FAILED or self.violations else int(is_incomplete or self.warnings > 0)
         )
         """0 without problems, 1 with missing messages or warnings, 2 if failed or with a violated contract."""
-        self.written = written_text(report)
+        self.written = report.written_text
         self.unreadable = unreadable_text([report])
         self._run, self._folder = run, folder
 

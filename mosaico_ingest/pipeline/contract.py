@@ -28,8 +28,8 @@ from mosaico_ingest.pipeline.selection import bind_conditions, row_selector, row
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline, pipelines_by_connection
 from mosaico_ingest.remote import RemotePath
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.report.events import ContractEvaluated, Noted, Observer
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

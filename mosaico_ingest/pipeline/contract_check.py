@@ -14,7 +14,7 @@ from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled
 from mosaico_ingest.pipeline.task import Task, open_job
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.blocks import Int64s
 from mosaico_ingest.rosbag.recording import Recording, time_bounds
 

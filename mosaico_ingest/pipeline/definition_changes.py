@@ -15,6 +15,7 @@ from pydantic import Field
 
 from mosaico_ingest.adapters.adapter import recorded_schema
 from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.display import counted
 from mosaico_ingest.documents import Part, document_schema, read_document
 from mosaico_ingest.errors import ContractError, IngestError
 from mosaico_ingest.findings import Finding, Severity, Span
@@ -23,7 +24,6 @@ from mosaico_ingest.job.yaml_source import KeyPath, load_source
 from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.plan import Plan, TopicPlan
 from mosaico_ingest.protocol import check_topic_name
-from mosaico_ingest.report.units import counted
 from mosaico_ingest.rosbag.blocks import Connection
 from mosaico_ingest.rosbag.definitions.model import Definition, spell
 

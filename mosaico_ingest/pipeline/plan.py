@@ -16,6 +16,7 @@ from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec, EncodedI
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract, ReadTopic
 from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.documents import Part, Unchecked, html_table
 from mosaico_ingest.findings import Finding, Span, escape_undecodable
 from mosaico_ingest.job.model import ErrorPolicy, Manifest, QuarantineSettings, SequenceSettings
@@ -24,7 +25,6 @@ from mosaico_ingest.job.values import StampSource, Target, TopicLevelErrorPolicy
 from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.task import Attempt, MemoryBudget
 from mosaico_ingest.remote import RemotePath
-from mosaico_ingest.report.units import count_text, counted
 from mosaico_ingest.rosbag.blocks import Attachment
 from mosaico_ingest.rosbag.definitions.model import Resolver
 

@@ -12,12 +12,12 @@ from pydantic import Field, GetJsonSchemaHandler
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
+from mosaico_ingest.display import count_text
 from mosaico_ingest.documents import Part, document_schema, html_table, read_document, read_limited
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.pipeline.plan import Plan, plan_headline
-from mosaico_ingest.report.contract import ContractResult
-from mosaico_ingest.report.units import count_text
+from mosaico_ingest.report.parts import ContractResult
 
 Json: TypeAlias = Any
 _NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic"), "files": ("file", "path")}

@@ -15,6 +15,7 @@ from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.contracts.clauses import Contract
 from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.display import bytes_text, counted
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
 from mosaico_ingest.job.fields import TopicGlob, image_settings, marked_fields, values_at
@@ -39,7 +40,6 @@ from mosaico_ingest.pipeline.selection import (
     part_range,
 )
 from mosaico_ingest.pipeline.task import MemoryBudget, Task
-from mosaico_ingest.report.units import bytes_text, counted
 from mosaico_ingest.rosbag.blocks import Attachment, Connection, Encoding
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Definition, Language

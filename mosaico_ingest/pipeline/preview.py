@@ -45,8 +45,8 @@ from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
 from mosaico_ingest.remote import RemotePath
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
 from mosaico_ingest.report.events import Event, Rejected
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.blocks import MessageBlock
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.version import __version__

@@ -38,7 +38,7 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     Unreadable,
 )
-from mosaico_ingest.report.timing import Step, Stopwatch
+from mosaico_ingest.report.parts import Step, Stopwatch
 from mosaico_ingest.rosbag.blocks import UnreadableRange
 from mosaico_ingest.rosbag.recording import DAMAGE_HELP, Recording, damage_error
 

@@ -18,12 +18,12 @@ from typing import TextIO
 
 from msgspec import Struct
 
+from mosaico_ingest.display import counted, time_text
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.model import QuarantineSettings
 from mosaico_ingest.job.values import Limit
 from mosaico_ingest.report.events import Event, Rejected, RunFinished
-from mosaico_ingest.report.units import counted, time_text
 from mosaico_ingest.rosbag.blocks import Connection, MessageBlock
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.rosbag.mcap.writer import McapWriter

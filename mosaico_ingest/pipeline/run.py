@@ -23,8 +23,6 @@ from mosaico_ingest.pipeline.provenance import check_provenance, fingerprint, is
 from mosaico_ingest.pipeline.pump import Written, verify, write_sequence
 from mosaico_ingest.pipeline.rejections import RejectionLog
 from mosaico_ingest.pipeline.task import Task, open_job
-from mosaico_ingest.report.collect import Collector
-from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
     BatchObserver,
     Event,
@@ -39,8 +37,8 @@ from mosaico_ingest.report.events import (
     ignore_events,
     log_level,
 )
-from mosaico_ingest.report.model import Report
-from mosaico_ingest.report.timing import Step, Stopwatch
+from mosaico_ingest.report.parts import ContractResult, Step, Stopwatch
+from mosaico_ingest.report.recording import Collector, Report
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import Recording
 

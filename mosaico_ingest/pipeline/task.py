@@ -10,7 +10,7 @@ from msgspec import Struct, structs
 
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.remote import with_network
-from mosaico_ingest.report.contract import ExpectationResult
+from mosaico_ingest.report.parts import ExpectationResult
 from mosaico_ingest.rosbag.compression import MAX_CHUNK_BYTES
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry, TypeResolver
 from mosaico_ingest.rosbag.recording import Recording, open_recording

@@ -25,7 +25,7 @@ from mosaico_ingest.pipeline.rejections import Quarantine
 from mosaico_ingest.pipeline.selection import Conditions, RowSelector, bind_conditions, block_times, row_times
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.report.events import Observer, Rejected, TopicProgress, TopicStatus
-from mosaico_ingest.report.timing import Step, Stopwatch, Timeline
+from mosaico_ingest.report.parts import Step, Stopwatch, Timeline
 from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 

@@ -1,4 +1,4 @@
-"""Events of a run: the display shows them while it runs, and `collect.Collector` turns them into the report."""
+"""Events of a run: the display shows them while it runs, and `recording.Collector` turns them into the report."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from msgspec import Struct
 from mosaico_ingest.findings import Finding, Stage
 
 if TYPE_CHECKING:  # pydantic and NumPy are slow to import
-    from mosaico_ingest.report.contract import ContractResult
-    from mosaico_ingest.report.timing import Step, TimelineReport
+    from mosaico_ingest.report.parts import ContractResult, Step, TimelineReport
 
 
 DOWNSAMPLING = ("every", "rate")

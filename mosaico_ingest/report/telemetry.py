@@ -7,7 +7,6 @@ from collections import defaultdict
 from dataclasses import dataclass, field
 
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.report.contract import ContractResult
 from mosaico_ingest.report.events import (
     DOWNSAMPLING,
     ContractEvaluated,
@@ -19,7 +18,7 @@ from mosaico_ingest.report.events import (
     TopicClosed,
     TopicProgress,
 )
-from mosaico_ingest.report.timing import Step
+from mosaico_ingest.report.parts import ContractResult, Step
 from mosaico_ingest.version import __version__
 
 try:

@@ -16,7 +16,7 @@ from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal
 from mosaico_ingest.job.model import Job, JobSettings, Origin
 from mosaico_ingest.pipeline.contract_check import check_contract, results_by_job
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 
 
 class Checked(Struct, frozen=True):

@@ -22,6 +22,7 @@ from mosaico_ingest.contracts.monitor import TopicMonitor
 from mosaico_ingest.contracts.rows import Evaluator, FieldExpression, bind_expression, message_rows
 from mosaico_ingest.contracts.values import Values
 from mosaico_ingest.decode.decoder import decoder_for
+from mosaico_ingest.display import counted, mean_rate_hz
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.reference import plain
 from mosaico_ingest.job.values import Stores
@@ -29,9 +30,7 @@ from mosaico_ingest.pipeline.contract import monitor_of
 from mosaico_ingest.pipeline.planning import plan_recording
 from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.report.contract import ContractResult, Outcome
-from mosaico_ingest.report.timing import mean_rate_hz
-from mosaico_ingest.report.units import counted
+from mosaico_ingest.report.parts import ContractResult, Outcome
 from mosaico_ingest.rosbag.blocks import Connection
 from mosaico_ingest.rosbag.definitions.model import Definition, Language
 

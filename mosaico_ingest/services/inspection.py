@@ -11,6 +11,7 @@ from pathlib import Path
 from mosaico_ingest.adapters.adapter import UnmodeledSpec
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.builtin import BUILTIN
+from mosaico_ingest.display import bytes_text, count_text, counted, mean_rate_hz, rate_text, seconds_text
 from mosaico_ingest.documents import Part, html_table
 from mosaico_ingest.errors import AdapterError
 from mosaico_ingest.findings import one_line
@@ -21,8 +22,6 @@ from mosaico_ingest.pipeline.plan import ExcludedTopic
 from mosaico_ingest.pipeline.planning import plan_connection
 from mosaico_ingest.pipeline.task import open_job
 from mosaico_ingest.remote import AnyPath, RemotePath
-from mosaico_ingest.report.timing import mean_rate_hz
-from mosaico_ingest.report.units import bytes_text, count_text, counted, rate_text, seconds_text
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, Int64s
 from mosaico_ingest.rosbag.definitions.model import Source
 from mosaico_ingest.rosbag.definitions.registry import ROS2, distro_type

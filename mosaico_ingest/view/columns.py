@@ -17,8 +17,9 @@ from mosaico_ingest.adapters.mapping.columns import time_ns
 from mosaico_ingest.destinations.store.files import opened
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
+from mosaico_ingest.display import mean_rate_hz
 from mosaico_ingest.ontology.registry import column_unit
-from mosaico_ingest.report.timing import Timeline, TimelineReport, mean_rate_hz
+from mosaico_ingest.report.parts import Timeline, TimelineReport
 
 _compute: Any = pc
 """`pyarrow.compute`, whose stubs do not accept arrays of any type."""

@@ -15,10 +15,10 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
+from mosaico_ingest.display import seconds_text, time_text
 from mosaico_ingest.errors import ViewError, missing_library
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.ontology.registry import column_unit
-from mosaico_ingest.report.units import seconds_text, time_text
 from mosaico_ingest.view.columns import Column, is_list, is_number, topic_columns
 from mosaico_ingest.view.pictures import require_suffix
 from mosaico_ingest.view.rows import first_rows

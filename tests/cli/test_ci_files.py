@@ -10,9 +10,9 @@ import pytest
 from metadata_files import write
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.cli.ci import CheckedRecording, write_ci_files
+from mosaico_ingest.cli.check import CheckedRecording, write_ci_files
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Location, Outcome
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Location, Outcome
 
 LOCATION = Location(file="job.yaml", line=7, column=5, end_line=7, end_column=9)
 

@@ -9,8 +9,7 @@ from typing import Any
 import jsonschema
 import pytest
 
-from mosaico_ingest.cli.app import main
-from mosaico_ingest.cli.completion import completer
+from mosaico_ingest.cli.app import completer, main
 from mosaico_ingest.ontology.registry import DEFINED, MODULES, ontology_type
 from mosaico_ingest.services.schemas import adapter_editor_schema, job_editor_schema
 

@@ -14,7 +14,7 @@ import pytest
 from rosbags.rosbag2 import Reader
 
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 ROOT = Path(__file__).resolve().parents[2]
 TYPED = {

@@ -10,7 +10,7 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 ROOT = Path(__file__).resolve().parents[2]
 SCHEMAS = sorted((ROOT / "schemas").glob("*.schema.json"))

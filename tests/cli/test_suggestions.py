@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.cli.quickstart import suggestions
+from mosaico_ingest.cli.manifests import suggestions
 
 DRIVE = Path(__file__).parents[2] / "configs" / "quickstart" / "drive.mcap"
 

@@ -13,13 +13,13 @@ from mosaico_ingest.cli import report as report_command
 from mosaico_ingest.cli import store as store_command
 from mosaico_ingest.cli.report import rejection_lines
 from mosaico_ingest.destinations.store import Store, StoreSink
+from mosaico_ingest.display import rate_text
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.files import RunReport
-from mosaico_ingest.report.model import Rejection, Report, TopicReport
-from mosaico_ingest.report.units import rate_text, written_text
+from mosaico_ingest.report.recording import Rejection, Report, TopicReport
+from mosaico_ingest.report.run import RunReport
 from mosaico_ingest.services.inspection import draft_manifest, estimate_rate_hz
 from mosaico_ingest.view.texts import value_text
 
@@ -131,12 +131,12 @@ def test_value_text_long_value_states_omitted_count(value: object, text: str) ->
 
 def test_written_text_interrupted_run_states_messages_of_recording(tmp_path: Path) -> None:
     (drive,) = run_quickstart(tmp_path).recordings
-    assert written_text(drive) == f"{drive.totals.written:,} of {drive.totals.read:,} messages written"
+    assert drive.written_text == f"{drive.totals.written:,} of {drive.totals.read:,} messages written"
     topics = tuple(topic.model_copy(update={"read": 1, "written": 1}) for topic in drive.topics)
     stopped = drive.model_copy(update={"status": RunStatus.INTERRUPTED, "topics": topics})
     promised = sum(topic.promised or 0 for topic in topics if topic.status is not TopicStatus.EXCLUDED)
     written = stopped.totals.written
-    assert written_text(stopped) == f"{written} messages written before the run stopped, of {promised:,}"
+    assert stopped.written_text == f"{written} messages written before the run stopped, of {promised:,}"
 
 
 def test_rates_of_inspect_init_and_run_agree(tmp_path: Path) -> None:

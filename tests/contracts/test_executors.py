@@ -31,7 +31,7 @@ from mosaico_ingest.report.events import (
     TopicProgress,
     ignore_batch,
 )
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.rosbag.definitions.registry import ROSTypeRegistry
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"

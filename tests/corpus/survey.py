@@ -20,7 +20,7 @@ from mosaico_ingest.errors import IngestError
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy
 from mosaico_ingest.report.events import TopicStatus
-from mosaico_ingest.report.model import Report, TopicReport
+from mosaico_ingest.report.recording import Report, TopicReport
 
 CORPUS = Path(__file__).resolve().parents[3] / "shared" / "corpus"
 UNMODELED = "Unmodeled"

@@ -10,7 +10,7 @@ from made_recordings import define, record
 
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.contract_check import check_contract
-from mosaico_ingest.report.contract import ExpectationResult
+from mosaico_ingest.report.parts import ExpectationResult
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND

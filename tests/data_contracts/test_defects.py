@@ -9,7 +9,7 @@ from defective_recordings import DEFECTS, Defect, Drive, clean_drive, write_driv
 
 from mosaico_ingest import api
 from mosaico_ingest.report.events import RunFinished
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.services.schemas import write_lock
 
 SCHEMA = '{"properties": {"vehicle": {"pattern": "^r[0-9]+$"}}, "required": ["vehicle"]}'

@@ -25,7 +25,7 @@ from mosaico_ingest.cli.app import main
 from mosaico_ingest.errors import BagError, NothingMatched
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.lint.engine import lint_paths
-from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.report.parts import ContractResult
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.services.draft_contract import (
     FieldKind,

@@ -14,8 +14,8 @@ from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
-from mosaico_ingest.report.contract import ContractResult, Outcome
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.parts import ContractResult, Outcome
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.recording import open_recording
 

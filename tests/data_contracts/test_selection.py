@@ -9,7 +9,7 @@ import pytest
 from made_recordings import define, record
 
 from mosaico_ingest import api
-from mosaico_ingest.report.contract import ContractResult
+from mosaico_ingest.report.parts import ContractResult
 
 START_NS = 1_700_000_000_000_000_000
 TICK_NS = 100_000_000

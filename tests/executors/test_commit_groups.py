@@ -18,7 +18,7 @@ from mosaico_ingest.executors.base import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import CommitStarted, Event, RunFinished, RunStatus, ignore_batch
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

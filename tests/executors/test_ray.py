@@ -20,7 +20,7 @@ from mosaico_ingest.api import compile_job
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.job.model import DestinationSettings
 from mosaico_ingest.report.events import Event, RunStarted
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 pytest.importorskip("ray", reason="Ray is not installed")
 

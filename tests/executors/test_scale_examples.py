@@ -18,7 +18,7 @@ import yaml
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.protocol.messages import Permission
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 from mosaico_ingest.serve import Keyring
 
 if sys.version_info >= (3, 11):

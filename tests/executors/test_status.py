@@ -16,8 +16,8 @@ from mosaico_ingest.cli.run import take_shard
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.lazy import LazySequence
-from mosaico_ingest.report.files import RunReport
-from mosaico_ingest.report.timing import Step
+from mosaico_ingest.report.parts import Step
+from mosaico_ingest.report.run import RunReport
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

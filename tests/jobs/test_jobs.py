@@ -21,7 +21,7 @@ from rosbags.typesys import Stores, get_typestore
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError
-from mosaico_ingest.report.model import Report, TopicReport
+from mosaico_ingest.report.recording import Report, TopicReport
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

@@ -21,7 +21,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.pages.browser import PAGE_SIZE, BrowserServer, StoreBrowser, name_glob
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.files import report_text
+from mosaico_ingest.report.run import report_text
 
 
 @pytest.fixture(scope="module")

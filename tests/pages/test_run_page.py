@@ -17,12 +17,11 @@ from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.pages.recording import VALUE_WIDTH, RecordingView
 from mosaico_ingest.pages.run import MAX_OPEN, run_page
-from mosaico_ingest.report.compare import compare_reports
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Occurrence, Outcome
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.files import read_report
-from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.model import Steps, UnreadableRange
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Occurrence, Outcome
+from mosaico_ingest.report.recording import Steps, UnreadableRange
+from mosaico_ingest.report.run import read_report
+from mosaico_ingest.report.summaries import compare_reports, markdown_summary
 from mosaico_ingest.rosbag.loader import ROSLoader
 from mosaico_ingest.view.texts import value_text
 

@@ -15,8 +15,7 @@ from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
-from mosaico_ingest.pages.sequence import sequence_page
-from mosaico_ingest.pages.snippets import sequence_snippets
+from mosaico_ingest.pages.sequence import sequence_page, sequence_snippets
 
 
 @pytest.fixture(scope="module")

@@ -7,8 +7,8 @@ import re
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.pages.timeline import MAX_TICKS, MIN_BAR, WIDTH, draw_track, time_axis
-from mosaico_ingest.report.timing import Gap, TimelineReport
+from mosaico_ingest.pages.design import MAX_TICKS, MIN_BAR, WIDTH, draw_track, time_axis
+from mosaico_ingest.report.parts import Gap, TimelineReport
 
 S = 10**9
 TWENTY_SECONDS = time_axis([0, 20 * S])

@@ -21,7 +21,7 @@ from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.pipeline.run import Outcome, make_plan, run_recording
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline
-from mosaico_ingest.report.model import TopicReport
+from mosaico_ingest.report.recording import TopicReport
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.serialization import Serializer
 

@@ -22,7 +22,7 @@ from mosaico_ingest.destinations.store.segment import SegmentWriter
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.pipeline.task import MemoryBudget
 from mosaico_ingest.report.events import Event, Observer, TopicProgress, ignore_events
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 from mosaico_ingest.rosbag import blocks, recording
 from mosaico_ingest.rosbag.blocks import Encoding
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver

@@ -22,7 +22,7 @@ from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.pipeline import provenance, split
 from mosaico_ingest.pipeline.topic import LATCHED_KEY
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 from mosaico_ingest.rosbag.recording import Recording
 from mosaico_ingest.services.status import Status
 

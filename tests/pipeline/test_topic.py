@@ -19,8 +19,8 @@ from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.pipeline.plan import TopicPlan
 from mosaico_ingest.pipeline.topic import TopicPipeline
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
-from mosaico_ingest.report.collect import Collector
 from mosaico_ingest.report.events import Expected, RunStarted
+from mosaico_ingest.report.recording import Collector
 from mosaico_ingest.rosbag.blocks import Connection, Encoding, MessageBlock
 from mosaico_ingest.rosbag.definitions.registry import TypeResolver
 from mosaico_ingest.rosbag.serialization import Serializer

@@ -15,7 +15,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mosaico_ingest import api
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 
 START_NS = 1_700_000_000_000_000_000
 CUT = b"\x00\x01\x00\x00\x01"

@@ -15,7 +15,7 @@ from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 from .conftest import RunJob, WriteBag, number
 

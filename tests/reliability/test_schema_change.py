@@ -10,7 +10,7 @@ import pytest
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 
 from .conftest import RunJob, WriteBag
 

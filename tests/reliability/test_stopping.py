@@ -12,7 +12,7 @@ import pytest
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.report.events import CommitStarted, Event, RunStatus, TopicProgress
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
 
 from .conftest import CUT, RunJob, WriteBag, number
 

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 from mosaico_ingest.cli.options import write_output
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import Finding, Severity, Stage
-from mosaico_ingest.report.collect import MAX_STRETCHES, Collector
 from mosaico_ingest.report.events import (
     Expected,
     Noted,
@@ -24,8 +23,8 @@ from mosaico_ingest.report.events import (
     TopicStatus,
     Unreadable,
 )
-from mosaico_ingest.report.files import RunReport
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import MAX_STRETCHES, Collector, Report
+from mosaico_ingest.report.run import RunReport
 
 IMU = Expected("/imu", "/sensors/imu", "sensor_msgs/msg/Imu", "IMUAdapter", "IMU", "built-in", 10)
 LEFT = Expected("/debug", "/debug", "std_msgs/msg/String", "", "", "left out", None, excluded=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from run_reports import recording, run, topic
 
-from mosaico_ingest.report.compare import ALL, Change, compare_reports
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.model import Report, TopicReport
+from mosaico_ingest.report.recording import Report, TopicReport
+from mosaico_ingest.report.summaries import ALL, Change, compare_reports
 
 
 def with_topics(number: int, *topics: TopicReport) -> Report:

@@ -5,12 +5,11 @@ from __future__ import annotations
 from datetime import datetime, timezone
 
 from mosaico_ingest.findings import Severity
-from mosaico_ingest.report.contract import ContractResult, ExpectationResult, Location, Outcome
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.files import RunReport
-from mosaico_ingest.report.markdown import markdown_summary
-from mosaico_ingest.report.metrics import contract_metrics, prometheus_text
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Location, Outcome
+from mosaico_ingest.report.recording import Report
+from mosaico_ingest.report.run import RunReport
+from mosaico_ingest.report.summaries import contract_metrics, markdown_summary, prometheus_text
 
 LOCATION = Location(file="job.yaml", line=7, column=5, end_line=7, end_column=9)
 

@@ -16,9 +16,9 @@ from mosaico_ingest.cli.app import command_line
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import ManifestError, SinkError
 from mosaico_ingest.report.events import RunStatus
-from mosaico_ingest.report.files import Header, ReportWriter, RunReport, combine, read_report, report_text
-from mosaico_ingest.report.metrics import prometheus_text
-from mosaico_ingest.report.model import Report
+from mosaico_ingest.report.recording import Report
+from mosaico_ingest.report.run import Header, ReportWriter, RunReport, combine, read_report, report_text
+from mosaico_ingest.report.summaries import prometheus_text
 from tests.support.run_reports import RUNS, recording
 
 DRIVE = Path(__file__).parents[2] / "configs/quickstart/drive.mcap"

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from mosaico_ingest.cli.app import command_line
-from mosaico_ingest.report.files import read_report
-from mosaico_ingest.report.timing import Step, Stopwatch
+from mosaico_ingest.report.parts import Step, Stopwatch
+from mosaico_ingest.report.run import read_report
 
 DRIVE = Path(__file__).resolve().parents[2] / "configs" / "quickstart" / "drive.mcap"
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.report.timing import MAX_BINS, MAX_GAPS, Timeline, TimelineReport
+from mosaico_ingest.report.parts import MAX_BINS, MAX_GAPS, Timeline, TimelineReport
 
 BATCHES = st.lists(st.lists(st.integers(-(10**18), 2 * 10**18), max_size=20), max_size=6)
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from mosaico_ingest.display import counted
 from mosaico_ingest.findings import join_names
-from mosaico_ingest.report.units import counted
 
 
 @pytest.mark.parametrize(("count", "text"), [(0, "0 rows"), (1, "1 row"), (12_345, "12,345 rows")])

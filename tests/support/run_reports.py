@@ -11,9 +11,9 @@ from html.parser import HTMLParser
 
 from mosaico_ingest.findings import Stage
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.files import RunReport, UsedManifest
-from mosaico_ingest.report.model import Rejection, Report, Steps, Stretch, TopicReport, UnreadableRange
-from mosaico_ingest.report.timing import TimelineReport
+from mosaico_ingest.report.parts import TimelineReport
+from mosaico_ingest.report.recording import Rejection, Report, Steps, Stretch, TopicReport, UnreadableRange
+from mosaico_ingest.report.run import RunReport, UsedManifest
 
 VOID = {"meta", "link", "input", "path", "img", "br"}
 NASTY = "<script>alert('|x|')</script> & \"quoted\""

@@ -19,7 +19,7 @@ from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.pages.browser import BrowserServer
 from mosaico_ingest.pages.run import run_page
 from mosaico_ingest.pages.sequence import sequence_page
-from mosaico_ingest.report.files import RunReport
+from mosaico_ingest.report.run import RunReport
 
 ROOT = Path(__file__).resolve().parents[2]
 IMAGES = ROOT / "docs" / "images"

@@ -14,13 +14,13 @@ from msgspec import Struct
 from mosaico_ingest.destinations.base import FamilyTopic
 from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.destinations.store.segment import Segment, combined
+from mosaico_ingest.display import bytes_text, count_text, counted, seconds_text, time_text
 from mosaico_ingest.documents import html_table
 from mosaico_ingest.errors import SinkError, missing_library
 from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, IfExists
 from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.remote import AnyPath
-from mosaico_ingest.report.units import bytes_text, count_text, counted, seconds_text, time_text
 
 if TYPE_CHECKING:
     import duckdb

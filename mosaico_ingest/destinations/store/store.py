@@ -36,12 +36,12 @@ from mosaico_ingest.destinations.store.model import (
     TopicInfo,
 )
 from mosaico_ingest.destinations.store.segment import ContentHash, column_makers, sorted_rows, time_span
+from mosaico_ingest.display import bytes_text, count_text, time_text
 from mosaico_ingest.documents import MAX_ROWS, html_table
 from mosaico_ingest.errors import SinkError
 from mosaico_ingest.findings import one_line, suggest_names
 from mosaico_ingest.job.values import parse_time
 from mosaico_ingest.remote import AnyPath, RemotePath, as_path
-from mosaico_ingest.report.units import bytes_text, count_text, time_text
 
 
 class Checked(Struct, frozen=True):

@@ -1,13 +1,8 @@
-"""Numbers, sizes and times as text for people."""
+"""Counts, sizes, rates and times as text for people."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from datetime import datetime, timezone
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:  # pydantic is slow to import
-    from mosaico_ingest.report.model import Report
 
 _STEP = 1000.0
 
@@ -34,6 +29,16 @@ def counted(count: int, noun: str) -> str:
 def percent_text(share: float) -> str:
     """Return a share as a percentage, such as `17 %`."""
     return f"{share * 100:.0f} %"
+
+
+def mean_rate_hz(count: int, start_ns: int | None, end_ns: int | None) -> float | None:
+    """Return the mean rate of a topic: its intervals per second between its own first and last time stamp.
+
+    None without an interval of positive length. Every rate that the package shows is computed by this function.
+    """
+    if start_ns is None or end_ns is None or end_ns <= start_ns:
+        return None
+    return (count - 1) / ((end_ns - start_ns) / 1e9)
 
 
 def rate_text(rate_hz: float | None) -> str:
@@ -91,25 +96,6 @@ def stored_text(source_bytes: int, stored_bytes: int, *, of: str = "") -> str:
     return f"stored in {bytes_text(stored_bytes)}{share}"
 
 
-def written_text(report: Report) -> str:
-    """Return the number of written messages, out of the messages read or, if the run stopped early, of the recording."""
-    written, read = report.totals.written, report.totals.read
-    promised = sum(topic.promised or 0 for topic in report.counted_topics)
-    if report.status.value in {"failed", "interrupted"} and promised > read:
-        return f"{counted(written, 'message')} written before the run stopped, of {count_text(promised)}"
-    rows = "" if report.totals.rows == written else f" as {counted(report.totals.rows, 'row')}"
-    return f"{count_text(written)} of {counted(read, 'message')} written{rows}"
-
-
 def written_cell(messages: int, rows: int) -> str:
     """Return the number of written messages, with the number of rows if it differs, such as `12 (34 rows)`."""
     return count_text(messages) if messages == rows else f"{count_text(messages)} ({counted(rows, 'row')})"
-
-
-def unreadable_text(reports: Iterable[Report]) -> str:
-    """Return the number of unreadable messages, such as `12`, `at least 12` or `unknown`."""
-    counts = [item.count for report in reports for item in report.unreadable_ranges]
-    total = sum(count or 0 for count in counts)
-    if None not in counts:
-        return count_text(total)
-    return f"at least {count_text(total)}" if total else "unknown"

@@ -1,4 +1,4 @@
-"""The timeline of rows per topic, and the stopwatch for the steps of a run."""
+"""Parts of reports that other documents contain, too: the results of data contracts, and the timelines of topics."""
 
 from __future__ import annotations
 
@@ -8,11 +8,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import ConfigDict, computed_field
 
 from mosaico_ingest.documents import Part
+from mosaico_ingest.findings import Finding, Severity, Span
 
 MAX_BINS = 120
 """Maximum number of bins of a timeline."""
@@ -25,11 +28,143 @@ GAP_FACTOR = 3
 IRREGULAR_FACTOR = 2
 """With `MIN_IRREGULAR` intervals or more, a gap is also longer than this many 90th percentiles of them."""
 MIN_IRREGULAR = 20
-
 _BUCKETS_PER_OCTAVE = 8
 _MANTISSA_SHIFT = 49  # leaves the exponent and three bits of the mantissa of a float64
 _EXPONENT_BIAS = 1023 * _BUCKETS_PER_OCTAVE
 _BUCKETS = 64 * _BUCKETS_PER_OCTAVE
+
+
+class ReportPart(Part):
+    """The base of the parts of a report."""
+
+    # Computed fields are written for other programs and ignored when a report is read.
+    model_config = ConfigDict(extra="ignore", defer_build=True)
+
+
+class Outcome(str, Enum):
+    """The outcome of one expectation."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+    """The expectation was not evaluated; `text` has the reason."""
+
+
+class Location(ReportPart):
+    """The location of an expectation in a manifest; lines and columns start at 1, and the end column is exclusive."""
+
+    file: str
+    line: int
+    column: int
+    end_line: int
+    end_column: int
+
+    @classmethod
+    def of(cls, span: Span) -> Location:
+        """Return a span as a part of a report."""
+        return cls(
+            file=span.file,
+            line=span.line,
+            column=span.column,
+            end_line=span.end_line,
+            end_column=span.end_column,
+        )
+
+    @property
+    def span(self) -> Span:
+        """The location as a span."""
+        return Span(self.file, self.line, self.column, self.end_line, self.end_column)
+
+
+class Occurrence(ReportPart):
+    """One violation of an expectation."""
+
+    log_time_ns: int | None = None
+    """Log time of the message, in ns since the epoch; for an interval, of the message that ends it."""
+    index: int | None = None
+    """Position of the message on its topic in log-time order, from 0."""
+    value: bool | int | float | str | None = None
+    """The value, in the unit of the result."""
+
+
+class ExpectationResult(ReportPart):
+    """The result of one expectation for the recording or one of its topics."""
+
+    expectation: str
+    """The key path of the expectation, such as `expect.topics./imu.rate`."""
+    severity: Severity
+    """`error` or `warning`."""
+    outcome: Outcome
+    text: str
+    """The result in one line, such as `the longest gap is 2.1 s, at most 50 ms expected`."""
+    key: str = ""
+    """The part of the key path below the recording or topic, such as `rate` or `fields.linear_acceleration.z.between`."""
+    topic: str | None = None
+    """The topic in the recording; None for an expectation of the recording or of a group."""
+    location: Location | None = None
+    """The location of the expectation's key; None without a manifest."""
+    measured: bool | int | float | str | None = None
+    """The measured value, in `unit`."""
+    limit: str = ""
+    """The expected value in words, such as `at most 50 ms`."""
+    unit: str = ""
+    """The unit of `measured` and of the occurrences: Hz, ns, messages, share, or empty."""
+    violations: int = 0
+    """Number of violations."""
+    first: Occurrence | None = None
+    """The first violation, if violations have a position."""
+    worst: Occurrence | None = None
+    """The violation that is farthest from the limit."""
+    explained: int = 0
+    """Number of violations that are not counted because events of the recorder explain them."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the expectation did not fail."""
+        return self.outcome is not Outcome.FAILED
+
+    @property
+    def line(self) -> str:
+        """The result in one line, with its topic."""
+        return f"{self.topic}: {self.text}" if self.topic else self.text
+
+    @property
+    def finding(self) -> Finding | None:
+        """The result as a finding; None for an expectation that passed without explained violations."""
+        text = self.line
+        span = None if self.location is None else self.location.span
+        if self.outcome is Outcome.FAILED:
+            severity = self.severity
+            return Finding("expectation-failed", severity, text, span)
+        if self.outcome is Outcome.SKIPPED:
+            return Finding("expectation-skipped", Severity.INFO, text, span)
+        return Finding("expectation-explained", Severity.INFO, text, span) if self.explained else None
+
+
+class ContractResult(ReportPart):
+    """The results of all expectations of one recording."""
+
+    on_failure: Literal["fail", "warn", "divert"]
+    """The action if an expectation with the severity `error` fails."""
+    results: tuple[ExpectationResult, ...] = ()
+    stored_as: str | None = None
+    """The name of the sequence that a recording was diverted to."""
+
+    @computed_field
+    @property
+    def passed(self) -> bool:
+        """Whether no expectation with the severity `error` failed."""
+        return not self.errors
+
+    @property
+    def errors(self) -> tuple[ExpectationResult, ...]:
+        """The failed expectations with the severity `error`."""
+        return tuple(one for one in self.results if not one.passed and one.severity is Severity.ERROR)
+
+    @property
+    def warnings(self) -> tuple[ExpectationResult, ...]:
+        """The failed expectations with the severity `warning`."""
+        return tuple(one for one in self.results if not one.passed and one.severity is Severity.WARNING)
 
 
 class Gap(Part):
@@ -58,16 +193,6 @@ class TimelineReport(Part):
     """Number of gaps."""
     gaps: tuple[Gap, ...] = ()
     """The longest gaps, ordered by time."""
-
-
-def mean_rate_hz(count: int, start_ns: int | None, end_ns: int | None) -> float | None:
-    """Return the mean rate of a topic: its intervals per second between its own first and last time stamp.
-
-    None without an interval of positive length. Every rate that the package shows is computed by this function.
-    """
-    if start_ns is None or end_ns is None or end_ns <= start_ns:
-        return None
-    return (count - 1) / ((end_ns - start_ns) / 1e9)
 
 
 @dataclass(slots=True)
@@ -167,18 +292,6 @@ class Timeline:
         return _bucket_start_ns(median), min(int(_buckets(np.array([limit_ns]))[0]) + 1, _BUCKETS)
 
 
-def _buckets(intervals_ns: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the bucket of each interval: eight for each power of two, and bucket 0 for intervals up to 1 ns."""
-    exponents = intervals_ns.astype(np.float64).view(np.int64) >> _MANTISSA_SHIFT
-    return np.maximum(exponents - _EXPONENT_BIAS, 0)
-
-
-def _bucket_start_ns(bucket: int) -> int:
-    """Return the shortest interval of a bucket, in ns."""
-    octave, part = divmod(bucket, _BUCKETS_PER_OCTAVE)
-    return ((_BUCKETS_PER_OCTAVE + part) << octave) // _BUCKETS_PER_OCTAVE
-
-
 class Step(str, Enum):
     """A step of a run whose time is measured."""
 
@@ -228,3 +341,15 @@ class Stopwatch:
     def add(self, step: Step, seconds: float) -> None:
         """Add time that another thread measured to a step."""
         self._seconds[step] += seconds
+
+
+def _buckets(intervals_ns: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the bucket of each interval: eight for each power of two, and bucket 0 for intervals up to 1 ns."""
+    exponents = intervals_ns.astype(np.float64).view(np.int64) >> _MANTISSA_SHIFT
+    return np.maximum(exponents - _EXPONENT_BIAS, 0)
+
+
+def _bucket_start_ns(bucket: int) -> int:
+    """Return the shortest interval of a bucket, in ns."""
+    octave, part = divmod(bucket, _BUCKETS_PER_OCTAVE)
+    return ((_BUCKETS_PER_OCTAVE + part) << octave) // _BUCKETS_PER_OCTAVE

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shlex
 from array import array
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from datetime import datetime, timedelta
 from functools import cached_property, reduce
@@ -22,15 +22,14 @@ import msgspec
 from pydantic import AfterValidator, BaseModel, Field, ValidationError, computed_field
 from typing_extensions import Self
 
+from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.documents import document_schema, html_table, read_document
-from mosaico_ingest.errors import ManifestError, SinkError
+from mosaico_ingest.errors import ManifestError, SinkError, gravest
 from mosaico_ingest.lazy import LazySequence, concatenate
-from mosaico_ingest.report.contract import ReportPart
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
-from mosaico_ingest.report.model import Report, Steps, topic_table
-from mosaico_ingest.report.units import count_text, counted
+from mosaico_ingest.report.parts import ReportPart
+from mosaico_ingest.report.recording import Report, Steps, topic_table
 
-_GRAVEST_FIRST = (130, 5, 1, 2, 6, 3, 4)
 UNSUCCESSFUL = (RunStatus.FAILED, RunStatus.INTERRUPTED, RunStatus.DIVERTED)
 """Statuses of recordings that were not stored as the job demands."""
 _SUMMED_TOTALS = ("read", "written", "filtered", "downsampled", "rejected", "stored_bytes")
@@ -191,116 +190,6 @@ class Footer(ReportPart):
     """The sums over all recordings of the file."""
 
 
-class _Line(msgspec.Struct):
-    """The values of a line that the index needs."""
-
-    tool: str | None = None
-    sequence: str | None = None
-    destination: str = ""
-    exit_code: int = 0
-
-
-class _Index:
-    """The positions of the recordings of a file in JSON Lines, which takes 24 bytes for each."""
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-        self.end = 0
-        """The offset behind the last complete line."""
-        self.summary: Summary | None = None
-        """The sums over all recordings, if the last run was not killed."""
-        self._tool = ""
-        self._manifests: dict[UsedManifest, None] = {}
-        self._runs: list[int] = []
-        """The position of the first recording of each run."""
-        self._offsets, self._keys, self._codes = array("q"), array("q"), array("q")
-
-    def read(self, file: IO[bytes]) -> Self:
-        """Add the lines of a file; an incomplete last line is ignored.
-
-        Raises:
-            ManifestError: The file is not a report in JSON Lines.
-        """
-        for number, line in enumerate(file, 1):
-            if not line.endswith(b"\n"):
-                break
-            try:
-                entry = msgspec.json.decode(line, type=_Line)
-            except msgspec.MsgspecError as error:
-                raise ManifestError(
-                    f"is not a report: line {number}: {error}", where=str(self.path), hint=_HINT
-                ) from error
-            if entry.tool is not None or not self._runs:
-                self.add_header(self._parse(line, Header, f"line {number}"))
-            elif entry.sequence is not None:
-                self.add(entry.sequence, entry.destination, entry.exit_code)
-            else:
-                self.summary = self._parse(line, Footer, f"line {number}").summary
-            self.end += len(line)
-        return self
-
-    def add_header(self, header: Header) -> None:
-        """Add a run whose header is at `end`."""
-        self.summary = None
-        self._tool = header.tool
-        self._manifests.update(dict.fromkeys(header.manifests))
-        self._runs.append(len(self._offsets))
-
-    def add(self, sequence: str, destination: str, exit_code: int) -> None:
-        """Add a recording whose line is at `end`."""
-        self._offsets.append(self.end)
-        self._keys.append(_key(sequence, destination))
-        self._codes.append(exit_code)
-
-    @property
-    def finished(self) -> set[int]:
-        """The keys of the recordings that were written."""
-        return {self._keys[position] for position in self._latest() if self._codes[position] in SUCCESSFUL}
-
-    @property
-    def resumed(self) -> int:
-        """Number of recordings whose line is of an earlier run than the last one."""
-        return sum(position < self._runs[-1] for position in self._latest()) if len(self._runs) > 1 else 0
-
-    def report(self) -> RunReport:
-        """Return the report of all runs; each recording is read at each access."""
-        latest = self._latest()
-        report = RunReport.model_construct(
-            tool=self._tool,
-            manifests=tuple(self._manifests),
-            recordings=LazySequence(lambda at: self._recording(latest[at]), range(len(latest)), ()),
-        )
-        return report if self.summary is None else report.with_summary(self.summary)
-
-    def _latest(self) -> Sequence[int]:
-        """Return the positions of the lines that no later run replaced."""
-        if len(self._runs) <= 1:
-            return range(len(self._offsets))
-        later: set[int] = set()
-        positions: list[int] = []
-        for start, end in reversed(list(zip(self._runs, [*self._runs[1:], len(self._offsets)], strict=True))):
-            positions += [at for at in reversed(range(start, end)) if self._keys[at] not in later]
-            later.update(self._keys[start:end])
-        return array("q", reversed(positions))
-
-    def _recording(self, position: int) -> Report:
-        offset = self._offsets[position]
-        try:
-            with self.path.open("rb") as file:
-                file.seek(offset)
-                line = file.readline()
-        except OSError as error:
-            raise ManifestError(f"cannot be read: {error.strerror}", where=str(self.path)) from error
-        return self._parse(line, Report, f"byte {offset}")
-
-    def _parse(self, line: bytes, model: type[_Model], position: str) -> _Model:
-        try:
-            return model.model_validate_json(line)
-        except ValidationError:
-            where = f"{self.path}: {position}"
-            return read_document(line, model, where=where, kind="a report", hint=_HINT)
-
-
 class ReportWriter:
     """Appends the recordings of a run to a file in JSON Lines.
 
@@ -409,11 +298,6 @@ def summarize(recordings: Iterable[Report]) -> Summary:
     return reduce(Summary.including, recordings, Summary())
 
 
-def gravest(codes: Collection[int]) -> int:
-    """Return the exit code of a run whose recordings have these exit codes."""
-    return next((code for code in _GRAVEST_FIRST if code in codes), max(codes, default=0))
-
-
 def report_schema() -> dict[str, Any]:
     """Return the JSON Schema (draft 2020-12) of a report file."""
     return document_schema(RunReport)
@@ -472,6 +356,116 @@ def report_text(report: RunReport, path: Path) -> Iterator[str]:
         yield separator + indent(recording.model_dump_json(indent=2), "    ")
         separator = ",\n"
     yield ("]" if separator == "\n" else "\n  ]") + end + "\n"
+
+
+class _Line(msgspec.Struct):
+    """The values of a line that the index needs."""
+
+    tool: str | None = None
+    sequence: str | None = None
+    destination: str = ""
+    exit_code: int = 0
+
+
+class _Index:
+    """The positions of the recordings of a file in JSON Lines, which takes 24 bytes for each."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.end = 0
+        """The offset behind the last complete line."""
+        self.summary: Summary | None = None
+        """The sums over all recordings, if the last run was not killed."""
+        self._tool = ""
+        self._manifests: dict[UsedManifest, None] = {}
+        self._runs: list[int] = []
+        """The position of the first recording of each run."""
+        self._offsets, self._keys, self._codes = array("q"), array("q"), array("q")
+
+    def read(self, file: IO[bytes]) -> Self:
+        """Add the lines of a file; an incomplete last line is ignored.
+
+        Raises:
+            ManifestError: The file is not a report in JSON Lines.
+        """
+        for number, line in enumerate(file, 1):
+            if not line.endswith(b"\n"):
+                break
+            try:
+                entry = msgspec.json.decode(line, type=_Line)
+            except msgspec.MsgspecError as error:
+                raise ManifestError(
+                    f"is not a report: line {number}: {error}", where=str(self.path), hint=_HINT
+                ) from error
+            if entry.tool is not None or not self._runs:
+                self.add_header(self._parse(line, Header, f"line {number}"))
+            elif entry.sequence is not None:
+                self.add(entry.sequence, entry.destination, entry.exit_code)
+            else:
+                self.summary = self._parse(line, Footer, f"line {number}").summary
+            self.end += len(line)
+        return self
+
+    def add_header(self, header: Header) -> None:
+        """Add a run whose header is at `end`."""
+        self.summary = None
+        self._tool = header.tool
+        self._manifests.update(dict.fromkeys(header.manifests))
+        self._runs.append(len(self._offsets))
+
+    def add(self, sequence: str, destination: str, exit_code: int) -> None:
+        """Add a recording whose line is at `end`."""
+        self._offsets.append(self.end)
+        self._keys.append(_key(sequence, destination))
+        self._codes.append(exit_code)
+
+    @property
+    def finished(self) -> set[int]:
+        """The keys of the recordings that were written."""
+        return {self._keys[position] for position in self._latest() if self._codes[position] in SUCCESSFUL}
+
+    @property
+    def resumed(self) -> int:
+        """Number of recordings whose line is of an earlier run than the last one."""
+        return sum(position < self._runs[-1] for position in self._latest()) if len(self._runs) > 1 else 0
+
+    def report(self) -> RunReport:
+        """Return the report of all runs; each recording is read at each access."""
+        latest = self._latest()
+        report = RunReport.model_construct(
+            tool=self._tool,
+            manifests=tuple(self._manifests),
+            recordings=LazySequence(lambda at: self._recording(latest[at]), range(len(latest)), ()),
+        )
+        return report if self.summary is None else report.with_summary(self.summary)
+
+    def _latest(self) -> Sequence[int]:
+        """Return the positions of the lines that no later run replaced."""
+        if len(self._runs) <= 1:
+            return range(len(self._offsets))
+        later: set[int] = set()
+        positions: list[int] = []
+        for start, end in reversed(list(zip(self._runs, [*self._runs[1:], len(self._offsets)], strict=True))):
+            positions += [at for at in reversed(range(start, end)) if self._keys[at] not in later]
+            later.update(self._keys[start:end])
+        return array("q", reversed(positions))
+
+    def _recording(self, position: int) -> Report:
+        offset = self._offsets[position]
+        try:
+            with self.path.open("rb") as file:
+                file.seek(offset)
+                line = file.readline()
+        except OSError as error:
+            raise ManifestError(f"cannot be read: {error.strerror}", where=str(self.path)) from error
+        return self._parse(line, Report, f"byte {offset}")
+
+    def _parse(self, line: bytes, model: type[_Model], position: str) -> _Model:
+        try:
+            return model.model_validate_json(line)
+        except ValidationError:
+            where = f"{self.path}: {position}"
+            return read_document(line, model, where=where, kind="a report", hint=_HINT)
 
 
 def _key(sequence: str, destination: str) -> int:
