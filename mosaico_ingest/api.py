@@ -114,7 +114,7 @@ def compile_job(manifest: Path, *, locked: bool = True) -> LazySequence[Job]:
     jobs = compile_manifests(load_manifests(manifest), locked=locked)
     for adapters, group in groupby(jobs.samples, key=lambda job: job.adapters):
         if adapters.load or adapters.override:
-            from mosaico_ingest.pipeline.compile import check_adapters
+            from mosaico_ingest.pipeline.adapter_check import check_adapters
 
             check_adapters(next(group))
     return jobs
