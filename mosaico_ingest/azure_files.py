@@ -39,6 +39,22 @@ _NO_LIMIT = timedelta(days=1)
 _STATUS = re.compile(r"status code: (\d\d\d)")
 
 
+_NO_FOLDERS = "a container has no folders, only blobs whose names contain slashes"
+
+
+def _refusal(operation: str, reason: str) -> Any:  # noqa: ANN401 - the overridden methods have different signatures
+    """Return a method for an operation that the package does not use."""
+
+    def refuse(_: AzureFiles, path: str = "", *_arguments: object) -> NoReturn:
+        raise IngestError(
+            f"the operation {operation} is not supported: {reason}",
+            where=f"az://{path}",
+            hint="use the tools of Azure Storage",
+        )
+
+    return refuse
+
+
 class AzureFiles(FileSystemHandler):
     """The blobs of one container; paths start with the name of the container."""
 
@@ -147,12 +163,13 @@ class AzureFiles(FileSystemHandler):
         with _translated_errors(path):
             obstore.delete(self._store, _blob(path))
 
-    def _refuse(self, *_: object) -> NoReturn:
-        raise NotImplementedError
-
-    _unused: Any = _refuse  # the overridden methods have different signatures
-    create_dir = delete_dir = delete_dir_contents = delete_root_dir_contents = _unused
-    move = copy_file = open_append_stream = _unused
+    create_dir = _refusal("create_dir", _NO_FOLDERS)
+    delete_dir = _refusal("delete_dir", _NO_FOLDERS)
+    delete_dir_contents = _refusal("delete_dir_contents", _NO_FOLDERS)
+    delete_root_dir_contents = _refusal("delete_root_dir_contents", _NO_FOLDERS)
+    move = _refusal("move", "a blob cannot be renamed")
+    copy_file = _refusal("copy_file", "the store copies content by reading and writing it")
+    open_append_stream = _refusal("open_append_stream", "a blob is written once")
 
 
 class _Input(RangedFile):

@@ -129,3 +129,20 @@ def test_url_without_account_is_an_error(service: BlobService, monkeypatch: pyte
     url = service.url("a").replace(f"account_name={ACCOUNT}&", "")
     with pytest.raises(IngestError, match="names no storage account"):
         as_path(url).exists()
+
+
+@pytest.mark.parametrize(
+    ("operation", "arguments"),
+    [
+        ("create_dir", ["container/a"]),
+        ("delete_dir", ["container/a"]),
+        ("move", ["container/a", "container/b"]),
+        ("copy_file", ["container/a", "container/b"]),
+        ("open_append_stream", ["container/a"]),
+    ],
+)
+def test_unsupported_operation_is_named(service: BlobService, operation: str, arguments: list[str]) -> None:
+    path = as_path(service.url("a"))
+    assert isinstance(path, RemotePath)
+    with pytest.raises(IngestError, match=f"^az://container/a: the operation {operation} is not supported: "):
+        getattr(path.filesystem, operation)(*arguments)

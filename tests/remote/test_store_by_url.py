@@ -106,7 +106,8 @@ def test_store_by_url_has_the_same_rows_as_a_store_on_disk(recording: Path, url:
         )
         assert there.scan("drive", theirs.name).read_all() == here.scan("drive", mine.name).read_all()
     assert [checked.problem for checked in verify(other)] == [None, None]
-    assert [key.partition("/")[0] for key in keys(url)] == ["catalog", "segments", "segments", "store.json"]
+    folders = ["catalog", "changes", "segments", "segments", "store.json"]
+    assert [key.partition("/")[0] for key in keys(url)] == folders
 
 
 def test_every_store_command_accepts_a_url(recording: Path, url: str, tmp_path: Path) -> None:

@@ -1,15 +1,11 @@
-"""The documents of a catalog behind a URL, and their snapshot.
-
-A snapshot is a cache that needs no agreement with writers: a row is valid while the object store lists its document with the
-same size and the same time of change. Documents that changed later, or that the snapshot lacks, are read one by one. A
-snapshot that is out of date, lost or written by several processes at the same time is therefore slow at worst.
-"""
+"""The documents of a catalog behind a URL, and their snapshots."""
 
 from __future__ import annotations
 
 import json
 from base64 import b64decode, b64encode
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import ExitStack, suppress
 from itertools import islice
 from typing import Any
 
@@ -20,7 +16,10 @@ from pydantic import BaseModel, ConfigDict
 
 from mosaico_ingest.destinations.base import check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.files import (
+    CHANGES,
     NotInStore,
+    new_session_id,
+    opened,
     sequence_changed,
     translate_errors,
 )
@@ -40,7 +39,7 @@ from mosaico_ingest.destinations.store.model import (
     check_not_merged,
 )
 from mosaico_ingest.destinations.store.segment import Segment
-from mosaico_ingest.errors import IngestError
+from mosaico_ingest.errors import SinkError, SinkUnavailable
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.registry import OntologyType, SerializationFormat
 from mosaico_ingest.remote import RemotePath
@@ -302,113 +301,226 @@ def _note(new: NewNote) -> NoteEntry:
 
 
 SUMMARY, DOCUMENT = "summary", "document"
-"""The columns with the content of a row."""
-_FOLDER = "snapshots"
-_FILE = "catalog-1.parquet"
-"""The name contains the version of the columns."""
+"""The columns with the content of a sequence; each has its own file."""
+_FOLDER, _INDEX = "snapshots", "index.parquet"
 _SETTLED_NS = 5 * 10**9
-"""Time since the last change after which a document may be in a snapshot; object stores list times in full seconds, so a
-later change of the same second would not be visible."""
+"""Time since the last change after which a document is recognized by its time of change; object stores list times in full
+seconds, so a later change of the same second would not be visible."""
 _GROUP_ROWS = 1000
-_SCHEMA = pa.schema(
+_CONTENT = {name: pa.schema([pa.field(name, pa.binary())]) for name in (SUMMARY, DOCUMENT)}
+
+
+class Row(Struct, frozen=True):
+    """A sequence in the index of a snapshot."""
+
+    key: str
+    """The name of its document, without the suffix."""
+    name: str
+    size: int
+    mtime_ns: int
+    """Size and time of change of the document that the row was built from; -1 if a later change may not be visible."""
+
+    def is_current(self, document: RemotePath) -> bool:
+        """Return whether a listed document has not changed since."""
+        stat = document.stat()
+        return (stat.st_size, stat.st_mtime_ns) == (self.size, self.mtime_ns)
+
+
+_INDEX_SCHEMA = pa.schema(
     [
         pa.field("key", pa.string()),
+        pa.field("name", pa.string()),
         pa.field("size", pa.int64()),
         pa.field("mtime_ns", pa.int64()),
-        pa.field(SUMMARY, pa.binary()),
-        pa.field(DOCUMENT, pa.binary()),
     ]
 )
 
 
-class Content(Struct, frozen=True):
-    """The content of a row, as JSON."""
+class DamagedSnapshot(SinkError):  # noqa: N818 - the condition, as in `errors`
+    """A file of a snapshot is missing or damaged."""
 
+
+class Content(Struct, frozen=True):
+    """The content of a sequence, as JSON."""
+
+    name: str
     summary: bytes
     document: bytes
 
 
-def read_rows(root: RemotePath, column: str, documents: Mapping[str, RemotePath]) -> dict[str, bytes]:
-    """Return a column of the snapshot for the listed documents that have not changed since; empty without a snapshot."""
-    rows: dict[str, bytes] = {}
-    for batch in _batches(root, ["key", "size", "mtime_ns", column]):
-        selected = _unchanged(batch, documents)
-        keys, values = batch.column("key").take(selected), batch.column(column).take(selected)
-        rows.update(
-            (str(key), value)
-            for key, value in zip(keys.to_pylist(), values.to_pylist(), strict=True)
-            if value is not None
+class Snapshot(Struct, frozen=True):
+    """The sequences of a catalog in three Parquet files: an index, the summaries and the documents, in the order of keys."""
+
+    folder: RemotePath
+    rows: tuple[Row, ...]
+
+    def read(self, column: str, positions: Collection[int]) -> Iterator[tuple[int, bytes]]:
+        """Yield the content of the rows at these positions, in their order; all of their row groups are read.
+
+        Raises:
+            DamagedSnapshot: The file is missing or damaged.
+        """
+        groups = sorted({position // _GROUP_ROWS for position in positions})
+        selected = set(positions)
+        for group, batch in zip(groups, _batches(self.folder, column, groups), strict=False):
+            start = group * _GROUP_ROWS
+            for offset, value in enumerate(batch.column(column)):
+                if start + offset in selected:
+                    yield start + offset, value.as_py()
+
+
+class Snapshots(Struct, frozen=True):
+    """The published snapshots of a catalog."""
+
+    number: int
+    """The highest number, 0 without snapshots."""
+    folders: tuple[RemotePath, ...]
+    """Its folders: several if writers published the same number, so that none of them may contain all changes."""
+    obsolete: tuple[RemotePath, ...]
+    """The files of earlier snapshots, which readers may no longer have open once the next one is published."""
+
+    @classmethod
+    def listed(cls, root: RemotePath) -> Snapshots:
+        """List the snapshots of a store."""
+        with translate_errors(root):
+            files = [path for path in (root / _FOLDER).listing(recursive=True) if path.is_file()]
+        published = [path.parent for path in files if path.name == _INDEX]
+        number = max(map(_number, published), default=0)
+        return cls(
+            number,
+            tuple(folder for folder in published if _number(folder) == number),
+            tuple(path for path in files if _number(path.parent) < number),
         )
-    return rows
+
+    def latest(self) -> Snapshot | None:
+        """Return the latest snapshot; None if there is none, if it is damaged, or if its number is ambiguous."""
+        if len(self.folders) != 1:
+            return None
+        (folder,) = self.folders
+        try:
+            with translate_errors(folder), opened(folder / _INDEX) as parquet:
+                columns = parquet.read().to_pydict()
+        except SinkUnavailable:
+            raise
+        except SinkError:
+            return None
+        return Snapshot(folder, tuple(map(Row, *(columns[name] for name in _INDEX_SCHEMA.names))))
+
+
+def _number(folder: RemotePath) -> int:
+    number = folder.name.partition("-")[0]
+    return int(number) if number.isdecimal() else 0
 
 
 def write_snapshot(
     root: RemotePath,
+    now_ns: Callable[[], int],
     list_documents: Callable[[], Mapping[str, RemotePath]],
     read: Callable[[Sequence[RemotePath]], Sequence[Content | None]],
-) -> None:
-    """Write a snapshot of all documents that have settled, and take rows that are valid from the earlier snapshot.
+) -> tuple[RemotePath, ...]:
+    """Write the next snapshot, and return the objects that are obsolete now: changes, and files of earlier snapshots.
 
-    `read` returns the contents of documents, and None for each that no longer exists.
+    `now_ns` returns the time of the server, `list_documents` the documents by key, and `read` the contents of documents, None for each that no longer exists.
+    Contents that have not changed are copied from the latest snapshot.
 
     Raises:
         SinkError: The snapshot cannot be written.
     """
-    clock = root / _FOLDER / "clock"
+    # The order of these steps is essential; see `ObjectCatalog`.
+    changes = list_changes(root)
+    snapshots = Snapshots.listed(root)
     with translate_errors(root):
-        clock.write_bytes(b"")  # its time of change is the time of the server
-        settled_ns = clock.stat().st_mtime_ns - _SETTLED_NS
-    missing = {key: path for key, path in list_documents().items() if path.stat().st_mtime_ns <= settled_ns}
-    target = root / _FOLDER / _FILE
-    with (
-        translate_errors(root),
-        pq.ParquetWriter(
-            target.filesystem_path, _SCHEMA, filesystem=target.filesystem, compression="zstd"
-        ) as writer,
-    ):
-        for batch in _batches(root, _SCHEMA.names):
-            valid = batch.take(_unchanged(batch, missing))
-            writer.write_batch(valid)
-            for key in valid.column("key").to_pylist():
-                missing.pop(str(key))
-        paths = iter(missing.values())
-        while group := list(islice(paths, _GROUP_ROWS)):
-            writer.write_batch(pa.RecordBatch.from_pylist(list(_rows(group, read(group))), schema=_SCHEMA))
+        settled_ns = now_ns() - _SETTLED_NS
+    documents = dict(sorted(list_documents().items()))
+    folder = root / _FOLDER / f"{snapshots.number + 1:09}-{new_session_id()}"
+    with ExitStack() as stack:
+        stack.enter_context(translate_errors(root))
+        writers = {name: stack.enter_context(_writer(folder, name)) for name in _CONTENT}
+        rows: list[Row] = []
+        pending: list[tuple[Row, Content]] = []
+        for row, content in _contents(documents, snapshots.latest(), read):
+            rows.append(row if row.mtime_ns <= settled_ns else Row(row.key, row.name, -1, -1))
+            pending.append((row, content))
+            if len(pending) == _GROUP_ROWS:
+                _write(writers, pending)
+        _write(writers, pending)
+    columns = {name: [getattr(row, name) for row in rows] for name in _INDEX_SCHEMA.names}
+    index = pa.BufferOutputStream()
+    pq.write_table(pa.table(columns, _INDEX_SCHEMA), index, compression="zstd")
+    with translate_errors(root):
+        (folder / _INDEX).write_bytes(index.getvalue().to_pybytes())
+    return (*changes, *snapshots.obsolete)
 
 
-def _rows(paths: Sequence[RemotePath], contents: Iterable[Content | None]) -> Iterator[dict[str, object]]:
-    for path, content in zip(paths, contents, strict=True):
-        if content is not None:
-            stat = path.stat()  # of the listing
-            yield {
-                "key": path.name,
-                "size": stat.st_size,
-                "mtime_ns": stat.st_mtime_ns,
-                SUMMARY: content.summary,
-                DOCUMENT: content.document,
-            }
+def list_changes(root: RemotePath) -> list[RemotePath]:
+    """Return the objects that name a sequence that was changed, see `changed_key`."""
+    with translate_errors(root):
+        return [path for path in (root / CHANGES).iterdir() if path.is_file()]
 
 
-def _batches(root: RemotePath, columns: Sequence[str]) -> Iterator[pa.RecordBatch]:
-    """Yield the rows of the snapshot; none if there is no snapshot, or if it is damaged."""
-    path = root / _FOLDER / _FILE
-    try:
-        with (
-            translate_errors(root),
-            pq.ParquetFile(path.filesystem_path, filesystem=path.filesystem) as parquet,
-        ):
-            yield from parquet.iter_batches(batch_size=_GROUP_ROWS, columns=list(columns))
-    except (IngestError, OSError, pa.ArrowException):
+def changed_key(change: RemotePath) -> str:
+    """Return the key of the sequence that a change names."""
+    return change.name.partition("-")[2]
+
+
+def _writer(folder: RemotePath, name: str) -> pq.ParquetWriter:
+    path = folder / f"{name}.parquet"
+    return pq.ParquetWriter(
+        path.filesystem_path, _CONTENT[name], filesystem=path.filesystem, compression="zstd"
+    )
+
+
+def _write(writers: Mapping[str, pq.ParquetWriter], pending: list[tuple[Row, Content]]) -> None:
+    """Write the rows as a row group of each file, and clear them."""
+    for name, writer in writers.items():
+        values = pa.array([getattr(content, name) for _, content in pending], pa.binary())
+        if pending:
+            writer.write_batch(pa.record_batch([values], schema=_CONTENT[name]))
+    pending.clear()
+
+
+def _contents(
+    documents: Mapping[str, RemotePath],
+    previous: Snapshot | None,
+    read: Callable[[Sequence[RemotePath]], Sequence[Content | None]],
+) -> Iterator[tuple[Row, Content]]:
+    """Yield the contents of documents in the order of their keys, from the previous snapshot if they have not changed."""
+    copies = _copies(previous)
+    copy = next(copies, None)
+    keys = iter(documents)
+    while group := list(islice(keys, _GROUP_ROWS)):
+        contents: dict[str, Content | None] = {}
+        for key in group:
+            while copy is not None and copy[0].key < key:
+                copy = next(copies, None)
+            if copy is not None and copy[0].key == key and copy[0].is_current(documents[key]):
+                contents[key] = copy[1]
+        missing = [key for key in group if key not in contents]
+        contents.update(zip(missing, read([documents[key] for key in missing]), strict=True))
+        for key in group:
+            if (content := contents[key]) is not None:
+                stat = documents[key].stat()  # of the listing
+                yield Row(key, content.name, stat.st_size, stat.st_mtime_ns), content
+
+
+def _copies(snapshot: Snapshot | None) -> Iterator[tuple[Row, Content]]:
+    """Yield the rows of a snapshot up to a damaged one."""
+    if snapshot is None:
         return
+    positions = range(len(snapshot.rows))
+    with suppress(DamagedSnapshot):
+        summaries, documents = (snapshot.read(name, positions) for name in (SUMMARY, DOCUMENT))
+        for row, (_, summary), (_, document) in zip(snapshot.rows, summaries, documents, strict=False):
+            yield row, Content(row.name, summary, document)
 
 
-def _unchanged(batch: pa.RecordBatch, documents: Mapping[str, RemotePath]) -> pa.Int64Array:
-    """Return the positions of rows whose document is listed with the same size and time of change."""
-    states = zip(*(batch.column(name).to_pylist() for name in ("key", "size", "mtime_ns")), strict=True)
-    positions: list[int] = []
-    for position, (key, size, mtime_ns) in enumerate(states):
-        if key in documents:
-            stat = documents[key].stat()
-            if (stat.st_size, stat.st_mtime_ns) == (size, mtime_ns):
-                positions.append(position)
-    return pa.array(positions, pa.int64())
+def _batches(folder: RemotePath, column: str, groups: Sequence[int]) -> Iterator[pa.RecordBatch]:
+    """Yield row groups of a file, one batch each."""
+    path = folder / f"{column}.parquet"
+    try:
+        with translate_errors(path), opened(path) as parquet:
+            yield from parquet.iter_batches(_GROUP_ROWS, row_groups=list(groups), columns=[column])
+    except SinkUnavailable:
+        raise
+    except (SinkError, IndexError) as err:
+        raise DamagedSnapshot("the snapshot of the catalog is damaged", where=str(path)) from err

@@ -15,6 +15,8 @@ Behind a URL:
     attachments/<sequence>/<session>-<number>-<name>
     claims/<sequence>/<session>              the claim of a session on a sequence
     sessions/<session>                       rewritten regularly while the session's writer is alive
+    changes/<id>-<sequence>                  names a sequence that was changed, until a snapshot contains the change
+    snapshots/<number>-<id>/                 copies of the catalog entries, see `documents`
 
 Objects cannot be renamed, so segments are written at their final paths; only segments in a catalog entry are valid.
 
@@ -341,6 +343,7 @@ def new_session_id() -> str:
 
 
 MARKER = "store.json"
+CLAIMS, CHANGES = "claims", "changes"
 
 _BEAT_S = 20.0
 _SILENT_S = 180.0
@@ -401,7 +404,7 @@ class ObjectFiles:
                 last_beat_ns = self._session(session).stat().st_mtime_ns
             except FileNotFoundError:
                 return False
-            return self._now_ns() - last_beat_ns < _SILENT_S * 1e9
+            return self.now_ns() - last_beat_ns < _SILENT_S * 1e9
 
     def in_use(self, session: str, grace_s: float) -> bool:  # noqa: ARG002 - the heartbeat starts before the first file
         """Return whether the session's writer is alive."""
@@ -463,7 +466,7 @@ class ObjectFiles:
     def _session(self, session: str) -> RemotePath:
         return self.root / f"sessions/{session}"
 
-    def _now_ns(self) -> int:
+    def now_ns(self) -> int:
         """Return the time of the store's clock, which all writers share."""
         clock = self.root / "clock"
         clock.write_bytes(b"")

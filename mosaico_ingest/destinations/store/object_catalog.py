@@ -4,6 +4,22 @@ Object stores have no transactions, but writes of objects are atomic, and listin
 writes its claim on a sequence, then lists the claims: of two writers, at least one sees the other and gives up. The
 holder of the claim reads, changes and writes the document. Conditional writes would replace the claims, but pyarrow's
 file systems have none; CONTRIBUTING.md compares them with obstore.
+
+Listings read neither all documents nor the list of all documents, but the latest snapshot and its tail: the documents of
+sequences that are claimed or named by a change. Four rules make this complete without conditional writes:
+
+1. A writer claims a sequence, writes its document, then a change that names it, and then releases the claim. Whoever
+   removes the claim of a dead writer writes the change first.
+2. A reader lists claims, changes and snapshots, in this order. Each object appears before its predecessor disappears.
+3. The writer of a snapshot lists changes, snapshots and documents, in this order, reads the documents, publishes the
+   snapshot under the next number, and then removes the changes that it listed. Since these changes were written after their
+   documents, the snapshot contains them.
+4. If two writers publish the same number, one may have removed changes that the other does not contain. Readers then use
+   neither, but the list of all documents, until somebody publishes the next number. A snapshot with a lower number is
+   ignored: its writer listed the documents before the writers of later numbers did.
+
+A snapshot is a cache: without one, or if it is damaged, readers list and read all documents. Garbage collection always lists
+them, because it removes files.
 """
 
 from __future__ import annotations
@@ -11,7 +27,7 @@ from __future__ import annotations
 import json
 import random
 import time
-from collections.abc import Callable, Collection, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from fnmatch import fnmatchcase
@@ -21,6 +37,7 @@ from typing import Any, TypeVar
 from urllib.parse import unquote
 
 import msgspec
+from msgspec import Struct
 
 from mosaico_ingest.destinations.base import FamilyTopic, sequence_exists
 from mosaico_ingest.destinations.store.documents import (
@@ -28,12 +45,18 @@ from mosaico_ingest.destinations.store.documents import (
     FORMAT,
     SUMMARY,
     Content,
+    DamagedSnapshot,
     SequenceDocument,
+    Snapshot,
+    Snapshots,
+    changed_key,
     check_unchanged,
-    read_rows,
+    list_changes,
     write_snapshot,
 )
 from mosaico_ingest.destinations.store.files import (
+    CHANGES,
+    CLAIMS,
     MARKER,
     NotInStore,
     ObjectFiles,
@@ -62,12 +85,20 @@ T = TypeVar("T")
 _SUFFIX = ".json"
 _THREADS = 16
 MAX_TAIL = 1000
-"""Number of documents above which a reader writes a snapshot first."""
+"""Number of changes, or of documents that no snapshot contains, above which a reader writes a snapshot first."""
 _LONGEST_NAME = 200
 """Object names do not contain longer sequence names in full."""
 _READS = 3
 """Number of attempts to read a document that is replaced at the same time."""
 _TRIES, _PAUSE_S = 8, 0.25
+
+
+class View(Struct, frozen=True):
+    """The sequences of a catalog at one moment, where each is found by name, in the order of names."""
+
+    snapshot: Snapshot | None
+    entries: Mapping[str, int | RemotePath | SequenceDocument]
+    """A position in the snapshot, or a document."""
 
 
 class ObjectCatalog:
@@ -76,6 +107,8 @@ class ObjectCatalog:
     def __init__(self, bucket: ObjectFiles, *, create: bool) -> None:
         self._bucket = bucket
         self._root = bucket.root
+        self._unmarked: set[str] = set()
+        """The keys of documents that may be written and whose change is not; their claims must not be removed."""
         marker = self._root / MARKER
         with translate_errors(self._root):
             try:
@@ -138,7 +171,9 @@ class ObjectCatalog:
         return changed is not None
 
     def release(self, session: str, sequence: str) -> None:
-        """See `StoreCatalog.release`."""
+        """See `StoreCatalog.release`; writes a change first if the document may have been written."""
+        if encoded(sequence) in self._unmarked:
+            self._mark(encoded(sequence))
         with translate_errors(self._root), suppress(FileNotFoundError):
             self._claim(session, sequence).unlink()
 
@@ -157,7 +192,7 @@ class ObjectCatalog:
 
     def names(self) -> list[str]:
         """See `StoreCatalog.names`."""
-        return sorted(self._name(path) for path in self._paths())
+        return list(self._view().entries)
 
     def sequence(self, name: str) -> SequenceInfo | None:
         """See `StoreCatalog.sequence`."""
@@ -165,25 +200,32 @@ class ObjectCatalog:
         return None if document is None else document.info(self._root)
 
     def headers(self, names: Collection[str]) -> tuple[SequenceInfo, ...]:
-        """See `StoreCatalog.headers`; reads one document per sequence."""
-        return tuple(self._infos(list(names)))
+        """See `StoreCatalog.headers`; many names use the snapshot of the catalog, others a document each."""
+        if len(names) <= MAX_TAIL:
+            return tuple(self._infos(list(names)))
+        selected = set(names)
+        documents = self._query(lambda view: self._documents(view, list(view.entries.keys() & selected)))
+        return tuple(one.info(self._root) for one in documents)
 
     def sequences(self) -> tuple[SequenceInfo, ...]:
         """See `StoreCatalog.sequences`; the sequences are not read at the same moment."""
         return tuple(one.info(self._root) for one in self._all())
 
     def listing(self, selection: SequenceFilter, *, after: str | None, limit: int | None) -> Listing:
-        """See `StoreCatalog.listing`; long pages and filters of the content use the snapshot of the catalog."""
+        """See `StoreCatalog.listing`; reads the summaries of the page, or of all sequences to filter their content."""
+        return self._query(lambda view: self._page(view, selection, after, limit))
+
+    def _page(self, view: View, selection: SequenceFilter, after: str | None, limit: int | None) -> Listing:
         names = [
-            name for name in self.names() if selection.match is None or fnmatchcase(name, selection.match)
+            name for name in view.entries if selection.match is None or fnmatchcase(name, selection.match)
         ]
         matches: dict[str, SequenceSummary] | None = None
         if selection.metadata or selection.incomplete:
-            matches = {one.name: one for one in self._summaries(names) if selection.selects(one)}
+            matches = {one.name: one for one in self._summaries(view, names) if selection.selects(one)}
             names = list(matches)
         rest = [name for name in names if after is None or name > after]
         page = rest[:limit]
-        summaries = self._summaries(page) if matches is None else [matches[name] for name in page]
+        summaries = self._summaries(view, page) if matches is None else [matches[name] for name in page]
         return Listing(tuple(summaries), len(names), page[-1] if page and len(page) < len(rest) else None)
 
     def family_topics(self, family: str | None, names: Collection[str]) -> tuple[FamilyTopic, ...]:
@@ -222,6 +264,7 @@ class ObjectCatalog:
         """See `StoreCatalog.delete_sequence`."""
         with self._holding(sequence):
             document = self._known(sequence)
+            self._unmarked.add(encoded(sequence))
             with translate_errors(self._root):
                 self._document(sequence).unlink()
         return document.paths
@@ -241,10 +284,9 @@ class ObjectCatalog:
     def forget(self, live: Collection[str]) -> set[str]:
         """See `StoreCatalog.forget`."""
         with translate_errors(self._root):
-            for claim in (self._root / "claims").listing(recursive=True):
-                if claim.is_file() and claim.name not in live:
-                    with suppress(FileNotFoundError):
-                        claim.unlink()
+            for claim in self._claims():
+                if claim.name not in live:
+                    self._remove_claim(claim)
         return {path for one in self._all() for path in one.paths}
 
     def _enter(self, claimed: Claim, new: NewSession) -> list[str]:
@@ -284,7 +326,8 @@ class ObjectCatalog:
             try:
                 yield
             finally:
-                self.release(holder, sequence)
+                with suppress(SinkError):  # a claim without a live session is ignored
+                    self.release(holder, sequence)
         finally:
             if session is None:
                 self._bucket.discard(holder)
@@ -312,65 +355,141 @@ class ObjectCatalog:
                     raise SequenceExists(
                         "another run is writing this sequence", where=sequence, hint="wait for it"
                     )
-                with suppress(FileNotFoundError):
-                    other.unlink()
+                self._remove_claim(other)
 
     def _document(self, sequence: str) -> RemotePath:
         return self._root / f"catalog/{encoded(sequence)}{_SUFFIX}"
 
     def _claim(self, session: str, sequence: str) -> RemotePath:
-        return self._root / f"claims/{encoded(sequence)}/{session}"
+        return self._root / f"{CLAIMS}/{encoded(sequence)}/{session}"
 
-    def _paths(self) -> list[RemotePath]:
+    def _claims(self) -> list[RemotePath]:
+        return [path for path in (self._root / CLAIMS).listing(recursive=True) if path.is_file()]
+
+    def _remove_claim(self, claim: RemotePath) -> None:
+        """Remove the claim of a dead writer, which may have written the document but no change."""
+        self._mark(claim.parent.name)
+        with suppress(FileNotFoundError):
+            claim.unlink()
+
+    def _mark(self, key: str) -> None:
+        """Write a change of the sequence with this key, after its document."""
         with translate_errors(self._root):
-            below = (self._root / "catalog").iterdir()
-            return [path for path in below if path.is_file() and path.suffix == _SUFFIX]
+            (self._root / f"{CHANGES}/{new_session_id()}-{key}").write_bytes(b"")
+        self._unmarked.discard(key)
 
     def _name(self, path: RemotePath) -> str:
         name = path.name.removesuffix(_SUFFIX)
         return self._read(path).name if len(name) > _LONGEST_NAME else unquote(name)
 
-    def _all(self) -> list[SequenceDocument]:
-        documents = self._current(DOCUMENT, SequenceDocument.model_validate_json, lambda document: document)
-        return sorted(documents, key=lambda one: one.name)
+    def _query(self, query: Callable[[View], T]) -> T:
+        """Return the result of a query over the snapshot and its tail, or over all documents if the snapshot is damaged."""
+        try:
+            return query(self._view())
+        except DamagedSnapshot:
+            return query(self._view(use_snapshot=False))
 
-    def _summaries(self, names: Sequence[str]) -> list[SequenceSummary]:
+    def _view(self, *, complete: bool = False, use_snapshot: bool = True, may_write: bool = True) -> View:
+        """Return where each sequence is found; `complete` lists all documents even if there is a snapshot."""
+        # The order of these steps is essential; see the module docstring.
+        with translate_errors(self._root):
+            claimed = {claim.parent.name for claim in self._claims()}
+        changes = list_changes(self._root)
+        snapshot = Snapshots.listed(self._root).latest() if use_snapshot else None
+        positions = {row.key: position for position, row in enumerate(snapshot.rows if snapshot else ())}
+        if snapshot is None or complete:
+            documents = self._listed()
+            tail = {
+                key: path
+                for key, path in documents.items()
+                if snapshot is None
+                or key not in positions
+                or not snapshot.rows[positions[key]].is_current(path)
+            }
+            valid = documents.keys() - tail.keys()
+        else:
+            keys = claimed.union(map(changed_key, changes))
+            tail = {key: self._root / f"catalog/{key}{_SUFFIX}" for key in keys}
+            valid = positions.keys() - tail.keys()
+        if may_write and max(len(tail), len(changes)) > MAX_TAIL:
+            with suppress(SinkError):  # readers may not be allowed to write
+                self._bucket.remove(
+                    write_snapshot(self._root, self._bucket.now_ns, self._listed, self._contents)
+                )
+                return self._view(complete=complete, may_write=False)
+        entries: dict[str, int | RemotePath | SequenceDocument] = {}
+        if snapshot is not None:
+            entries.update((snapshot.rows[positions[key]].name, positions[key]) for key in valid)
+        if snapshot is None or complete:
+            entries.update((self._name(path), path) for path in tail.values())
+        else:
+            entries.update((one.name, one) for one in self._read_all(list(tail.values())) if one is not None)
+        return View(snapshot, dict(sorted(entries.items(), key=itemgetter(0))))
+
+    def _all(self) -> list[SequenceDocument]:
+        """Return all documents, sorted by name; complete even if an object of the tail is missing."""
+
+        def read(view: View) -> list[SequenceDocument]:
+            return self._documents(view, list(view.entries))
+
+        try:
+            return read(self._view(complete=True))
+        except DamagedSnapshot:
+            return read(self._view(use_snapshot=False))
+
+    def _summaries(self, view: View, names: Sequence[str]) -> list[SequenceSummary]:
         """Return the summaries of the sequences that still exist, in the order of the names."""
-        if len(names) <= MAX_TAIL:
-            return list(map(SequenceSummary.of, self._infos(names)))
-        summaries = {one.name: one for one in self._current(SUMMARY, _decode_summary, self._summary)}
-        return [summaries[name] for name in names if name in summaries]
+        decode = msgspec.json.Decoder(SequenceSummary).decode
+        return list(self._values(view, names, SUMMARY, decode, self._summary))
+
+    def _documents(self, view: View, names: Sequence[str]) -> list[SequenceDocument]:
+        """Return the documents of the sequences that still exist, in the order of the names."""
+        decode = SequenceDocument.model_validate_json
+        return list(self._values(view, names, DOCUMENT, decode, lambda document: document))
+
+    def _values(
+        self,
+        view: View,
+        names: Sequence[str],
+        column: str,
+        decode: Callable[[bytes], T],
+        derive: Callable[[SequenceDocument], T],
+    ) -> Iterator[T]:
+        """Yield a value for each sequence, from the snapshot or its document."""
+        entries = {name: view.entries[name] for name in names}
+        values: dict[str, T] = {}
+        positions = {entry: name for name, entry in entries.items() if isinstance(entry, int)}
+        if view.snapshot is not None and positions:
+            contents = view.snapshot.read(column, positions.keys())
+            values.update((positions[position], decode(content)) for position, content in contents)
+        paths = {name: entry for name, entry in entries.items() if isinstance(entry, RemotePath)}
+        documents = zip(paths, self._read_all(list(paths.values())), strict=True)
+        values.update((name, derive(document)) for name, document in documents if document is not None)
+        for name, entry in entries.items():
+            if isinstance(entry, SequenceDocument):
+                yield derive(entry)
+            elif name in values:
+                yield values[name]
 
     def _summary(self, document: SequenceDocument) -> SequenceSummary:
         return SequenceSummary.of(document.info(self._root))
 
-    def _current(
-        self, column: str, decode: Callable[[bytes], T], derive: Callable[[SequenceDocument], T]
-    ) -> list[T]:
-        """Return a value for each sequence, from the snapshot or, if it changed since, from its document."""
-        documents = self._listed()
-        rows = read_rows(self._root, column, documents)
-        if len(documents) - len(rows) > MAX_TAIL:
-            with suppress(SinkError):  # readers may not be allowed to write
-                write_snapshot(self._root, self._listed, self._contents)
-                rows = read_rows(self._root, column, documents)
-        tail = [path for key, path in documents.items() if key not in rows]
-        return [
-            *map(decode, rows.values()),
-            *(derive(one) for one in self._read_all(tail) if one is not None),
-        ]
-
     def _contents(self, paths: Sequence[RemotePath]) -> list[Content | None]:
-        """Return the snapshot row of each document, None if the document no longer exists."""
+        """Return the content of each document, None if the document no longer exists."""
         return [
             None
             if document is None
-            else Content(msgspec.json.encode(self._summary(document)), _encoded_document(document))
+            else Content(
+                document.name, msgspec.json.encode(self._summary(document)), _encoded_document(document)
+            )
             for document in self._read_all(paths)
         ]
 
     def _listed(self) -> dict[str, RemotePath]:
-        return {path.name: path for path in self._paths()}
+        """List all documents by key."""
+        with translate_errors(self._root):
+            paths = [path for path in (self._root / "catalog").iterdir() if path.is_file()]
+        return {path.name.removesuffix(_SUFFIX): path for path in paths if path.suffix == _SUFFIX}
 
     def _read_all(self, paths: Sequence[RemotePath]) -> list[SequenceDocument | None]:
         with ThreadPoolExecutor(_THREADS, thread_name_prefix="catalog") as pool:
@@ -405,6 +524,8 @@ class ObjectCatalog:
                 raise SinkError(f"the document cannot be read: {problem}", where=str(path)) from err
 
     def _put(self, document: SequenceDocument) -> None:
+        """Write a document; `release` writes the change that names it."""
+        self._unmarked.add(encoded(document.name))
         with translate_errors(self._root):
             self._document(document.name).write_bytes(_encoded_document(document))
 
@@ -415,10 +536,6 @@ def _parsed(path: RemotePath) -> SequenceDocument:
 
 def _encoded_document(document: SequenceDocument) -> bytes:
     return json.dumps(document.model_dump(mode="python"), default=str).encode()
-
-
-def _decode_summary(content: bytes) -> SequenceSummary:
-    return msgspec.json.decode(content, type=SequenceSummary)
 
 
 def _number(marker: bytes) -> int:
