@@ -32,6 +32,8 @@ FIRST_GROUP_BYTES, MAX_GROUP_LENGTH = 2 << 20, 64
 Large groups amortize the fixed cost of a read; the first one is small, so that the next stage starts early."""
 _FEW_ROWS_PER_LENGTH = 8
 """With fewer messages per distinct length on average, `pack` gathers words instead of copying length by length."""
+_MAX_ELEMENT_BYTES = 1 << 12
+"""Size up to which numpy copies slices faster as elements of one type than as rows of bytes."""
 _MIN_WORD_BYTES, _MAX_WORD_BYTES = 4, 64
 """Range of the word size in which `pack` gathers payloads: it needs one index per word instead of one per byte."""
 Bytes = NDArray[np.uint8]
@@ -385,8 +387,11 @@ def fixed_slices(data: Bytes, starts: Int64s, size: int) -> Bytes:
 
     The caller has checked that every slice lies inside the buffer.
     """
-    windows = np.ndarray((len(data) - size + 1, size), np.uint8, data, strides=(1, 1))
-    return windows[starts]
+    if not 0 < size <= _MAX_ELEMENT_BYTES:
+        windows = np.ndarray((len(data) - size + 1, size), np.uint8, data, strides=(1, 1))
+        return windows[starts]
+    elements = np.ndarray(len(data) - size + 1, f"V{size}", data, strides=1)
+    return elements[starts].view(np.uint8).reshape(len(starts), size)
 
 
 def rows_by_connection(connections: NDArray[np.integer]) -> Iterator[tuple[int, Int64s]]:

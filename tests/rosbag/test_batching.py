@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Generator, Iterator
+from collections.abc import Generator, Iterator, Sequence
 from functools import partial
 from itertools import pairwise
 from random import Random
@@ -21,6 +21,7 @@ from mosaico_ingest.rosbag.blocks import (
     MessageBlock,
     ReadResult,
     ReadTask,
+    fixed_slices,
     group_by_bytes,
     pack,
     rows_by_connection,
@@ -55,6 +56,18 @@ def rows_of(block: MessageBlock) -> list[Row]:
 
 
 ROWS = st.lists(st.tuples(st.integers(0, 50), st.binary(max_size=12)), min_size=1, max_size=60)
+
+
+@pytest.mark.parametrize("size", [0, 1, 31, 4096, 4097, 6000])
+@pytest.mark.parametrize("starts", [[], [0], [5999, 0, 17, 17, 6000], range(0, 6000, 7)])
+def test_fixed_slices_any_size_equal_slices_of_the_bytes(size: int, starts: Sequence[int]) -> None:
+    data = np.random.default_rng(size).integers(0, 256, 12_000, np.uint8)
+
+    slices = fixed_slices(data, np.array(starts, np.int64), size)
+
+    assert slices.shape == (len(starts), size)
+    assert slices.tobytes() == b"".join(data[start : start + size].tobytes() for start in starts)
+    assert not np.shares_memory(slices, data)
 
 
 @given(ROWS)
