@@ -162,8 +162,10 @@ def _group_findings(job: Job, recording: Recording) -> Iterator[Finding]:
 
 def _interrupted_replacement(job: Job) -> Iterator[Finding]:
     """Yield a finding if readers do not see the sequence while it is replaced."""
+    if job.sequence.if_exists is not IfExists.REPLACE:
+        return
     destination = destination_of(job.destination)
-    if job.sequence.if_exists is IfExists.REPLACE and not destination.replaces_atomically:
+    if not destination.replaces_atomically:
         yield Finding(
             "replaced-by-deletion",
             Severity.INFO,
