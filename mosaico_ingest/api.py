@@ -21,7 +21,6 @@ from msgspec import structs
 from mosaico_ingest.documents import read_limited
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.findings import Finding, Severity
-from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.lazy import LazySequence
@@ -34,6 +33,7 @@ from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
+    from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.pipeline.plan import Plan
     from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument
     from mosaico_ingest.services.check import Checked
@@ -160,6 +160,8 @@ def quick_config(
     Raises:
         ManifestError: An option has an invalid value.
     """
+    from mosaico_ingest.job.config import ROSInjectionConfig
+
     if sequence_name is None:
         from mosaico_ingest.services.inspection import default_name
 
@@ -183,6 +185,7 @@ def inspect_recording(path: AnyPath | str, *, ros_distro: str | None = None) -> 
     Raises:
         BagError: The recording cannot be opened.
     """
+    from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.services.inspection import inspect
 
     config = ROSInjectionConfig(file_path=path, sequence_name="inspected", ros_distro=ros_distro)
@@ -359,10 +362,10 @@ def _tasks(jobs: Sequence[Job | Task | ROSInjectionConfig]) -> LazySequence[Task
 def _parts_of(job: Job | Task | ROSInjectionConfig) -> Iterator[Task]:
     if isinstance(job, Task):
         yield job
-    elif isinstance(job, ROSInjectionConfig):
-        yield from (Task(part, dry_run=job.dry_run) for part in _parts(job.job))
-    else:
+    elif isinstance(job, Job):
         yield from map(Task, _parts(job))
+    else:
+        yield from (Task(part, dry_run=job.dry_run) for part in _parts(job.job))
 
 
 def _task(job: Job | Task | ROSInjectionConfig) -> Task:

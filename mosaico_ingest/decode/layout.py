@@ -12,12 +12,11 @@ For example, `std_msgs/Header header; float64 x; float64[] ranges` in CDR has th
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from typing import Any, TypeAlias
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -338,8 +337,7 @@ def compile_layout(definition: Definition, encoding: Encoding) -> Layout:
     return Layout(encoding, draft.body(), record)
 
 
-@dataclass(slots=True)
-class _Draft:
+class _Draft(Struct):
     """The steps compiled so far; `open_block` is a block that may still grow."""
 
     steps: list[Step] = field(default_factory=list[Step])

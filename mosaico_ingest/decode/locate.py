@@ -42,6 +42,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from struct import Struct
 
+import msgspec
 import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
@@ -346,8 +347,7 @@ def locate_lockstep(layout: Layout, payloads: Payloads) -> LocatedMessages:
     return located.take(np.flatnonzero(~is_invalid)) if is_invalid.any() else located
 
 
-@dataclass(slots=True)
-class _Cursor:
+class _Cursor(msgspec.Struct):
     """The current position in each of m messages; shapes (m,)."""
 
     pos: Int64s

@@ -7,13 +7,12 @@ import uuid
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from mosaico_ingest.adapters.python import register_default_adapter, registered_adapters
 from mosaico_ingest.destinations.base import destination_of, keep_destinations_open
@@ -154,8 +153,7 @@ def _size(path: AnyPath) -> int | None:
     return sum(_size(part) or 0 for part in path.iterdir()) if path.is_dir() else path.stat().st_size
 
 
-@dataclass(slots=True)
-class Batch:
+class Batch(Struct):
     """The recordings of a batch by position; every started recording gets exactly one report.
 
     Recordings are read from `source` one by one, so a batch may be of any size. Only recordings whose report has not been

@@ -8,7 +8,6 @@ import pickle
 import signal
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from functools import partial
 from itertools import chain, islice
 from multiprocessing.connection import Connection, wait
@@ -16,7 +15,7 @@ from multiprocessing.context import SpawnProcess
 from multiprocessing.reduction import ForkingPickler
 
 import pyarrow as pa
-from msgspec import Struct, structs
+from msgspec import Struct, field, structs
 
 from mosaico_ingest.destinations.base import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
@@ -71,8 +70,7 @@ class Processes(Struct, frozen=True):
                 pool.shut_down()
 
 
-@dataclass(slots=True)
-class _Worker:
+class _Worker(Struct):
     """A worker process, the parent's end of its pipe, and the recordings it runs."""
 
     process: SpawnProcess
@@ -85,8 +83,7 @@ class _Worker:
     """The positions of those without a report, in order, and whether they were started."""
 
 
-@dataclass(slots=True)
-class _Pool:
+class _Pool(Struct):
     batch: Batch
     size: int
     attempts: int

@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from typing import TypeAlias
 
 import msgspec
 import yaml
-from msgspec import Struct
+from msgspec import Struct, field
 
 from mosaico_ingest.findings import Edit, Finding, Severity, Span
 
@@ -131,8 +130,7 @@ class LimitExceeded(Exception):  # noqa: N818 - a signal inside this package tha
         self.finding = finding
 
 
-@dataclass(slots=True)
-class _Node:
+class _Node(Struct):
     """A value, its span, and the spans of the values inside it, by relative key path."""
 
     value: Value

@@ -11,12 +11,11 @@ import time
 from collections import Counter
 from collections.abc import Generator, Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import TextIO
 
-from msgspec import Struct
+from msgspec import Struct, field
 
 from mosaico_ingest.display import counted, time_text
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError
@@ -254,8 +253,7 @@ def _sequence_of(index: Path) -> str | None:
         return None
 
 
-@dataclass(slots=True)
-class _Pending:
+class _Pending(Struct):
     """Messages of one topic that broke one rule and have not been logged."""
 
     first: Rejected
@@ -264,8 +262,7 @@ class _Pending:
     """Monotonic time from which the messages may be logged."""
 
 
-@dataclass(slots=True)
-class RejectionLog:
+class RejectionLog(Struct):
     """An observer that logs undecodable messages: the first of each topic and rule immediately, the others in groups."""
 
     sequence: str

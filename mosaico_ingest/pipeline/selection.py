@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -106,8 +105,7 @@ def row_selector(plan: Plan, topic: TopicPlan) -> RowSelector | None:
     return RowSelector(topic) if topic.rate is not None or topic.has_conditions else None
 
 
-@dataclass(slots=True)
-class RowSelector:
+class RowSelector(Struct):
     """Selects the rows of one topic by time range, conditions and rate; its state spans all blocks of the topic."""
 
     plan: TopicPlan
@@ -255,8 +253,7 @@ def condition_findings(
     yield Finding("operand-type", Severity.ERROR, message, span, hint)
 
 
-@dataclass(slots=True)
-class ConditionFilter:
+class ConditionFilter(Struct):
     """Evaluates the conditions of one topic; its state spans all blocks of the topic."""
 
     _previous: list[Any] = field(default_factory=list[Any])

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pyarrow as pa
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
@@ -67,8 +66,7 @@ class _Converted(Struct, frozen=True):
     """Positions of the messages whose time is the log time, because they do not have the selected time."""
 
 
-@dataclass(slots=True)
-class TopicPipeline:
+class TopicPipeline(Struct):
     """Decodes, adapts and writes the messages of one topic, and counts them.
 
     A message that breaks a policy of `raise` or `finalize` ends the topic at this message: the rows before it are

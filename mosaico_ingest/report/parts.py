@@ -5,12 +5,12 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from enum import Enum
 from typing import Literal
 
 import numpy as np
+from msgspec import Struct, field
 from numpy.typing import NDArray
 from pydantic import ConfigDict, computed_field
 
@@ -195,8 +195,7 @@ class TimelineReport(Part):
     """The longest gaps, ordered by time."""
 
 
-@dataclass(slots=True)
-class Timeline:
+class Timeline(Struct):
     """Counts of rows and of the intervals between them; times may come in any order."""
 
     step_ns: int = FIRST_BIN_NS

@@ -15,13 +15,12 @@ import threading
 from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass, field
 from itertools import pairwise
 from types import TracebackType
 from typing import Generic, TypeVar
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 
 from mosaico_ingest.rosbag.blocks import EARLIEST_NS, LATEST_NS, MessageBlock, ReadTask, pack, sort_by_time
 
@@ -158,8 +157,7 @@ class Prefetcher(Generic[T]):
         return False
 
 
-@dataclass(slots=True)
-class _Pending:
+class _Pending(Struct):
     """The blocks of one connection that have not been yielded yet."""
 
     blocks: list[MessageBlock] = field(default_factory=list[MessageBlock])

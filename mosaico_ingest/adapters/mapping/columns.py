@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -26,8 +25,7 @@ Mask = NDArray[np.bool_]
 SECOND_NS = 1_000_000_000
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Axis:
+class Axis(Struct, frozen=True, eq=False):
     """One level of lists: how consecutive elements form n rows.
 
     Offsets start at 0. A null row has no elements, except in fixed-size lists, where its elements exist and are unused.
@@ -62,8 +60,7 @@ class Axis:
         return variable_list(values, self.offsets, self.null, type_)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class Column:
+class Column(Struct, frozen=True, eq=False):
     """The values of the innermost elements, or one value per row without axes. A literal stays an Arrow scalar."""
 
     values: Array | Scalar

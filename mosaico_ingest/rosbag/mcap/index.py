@@ -5,12 +5,11 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
 from functools import partial
 from typing import TypeVar
 
 import numpy as np
-from msgspec import Struct
+from msgspec import Struct, field
 from msgspec.structs import replace
 
 from mosaico_ingest.containers import MCAP
@@ -109,8 +108,7 @@ class Extent(Struct, frozen=True):
         return list(struct.iter_unpack("<HQ", self.indexes))
 
 
-@dataclass(slots=True)
-class McapIndex:
+class McapIndex(Struct):
     """Schemas, channels and extents of a file."""
 
     schemas: dict[int, SchemaRecord] = field(default_factory=dict[int, SchemaRecord])

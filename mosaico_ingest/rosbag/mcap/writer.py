@@ -6,10 +6,10 @@ import json
 import struct
 import zlib
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import zstandard
+from msgspec import Struct, field
 
 from mosaico_ingest.containers import MCAP
 from mosaico_ingest.errors import BagError
@@ -26,8 +26,7 @@ _NO_SCHEMA = 0
 """The schema id of channels without a schema, such as JSON without a JSON Schema."""
 
 
-@dataclass(slots=True)
-class _Chunk:
+class _Chunk(Struct):
     """The content of the chunk being written."""
 
     data: bytearray = field(default_factory=bytearray)
