@@ -55,6 +55,14 @@ def collect_garbage_as_usual() -> None:
     gc.set_threshold(*DEFAULT_THRESHOLD)
 
 
+def set_up_worker(level: str, log_format: LogFormat, *, python_adapters: bool) -> None:
+    """Set up logging, garbage collection and the import of pandas in a worker process, as in its parent."""
+    set_up_logging(level, log_format)
+    if not python_adapters:
+        hide_pandas()
+    collect_garbage_as_usual()
+
+
 def hide_pandas(jobs: Sequence[Job] = ()) -> None:
     """Make pyarrow conclude that pandas is absent, unless Python adapters run, which may return series.
 
@@ -63,7 +71,7 @@ def hide_pandas(jobs: Sequence[Job] = ()) -> None:
     """
     if (
         "pandas" in sys.modules
-        or any(map(_uses_python_adapters, LazySequence.of(jobs).samples))
+        or any(map(uses_python_adapters, LazySequence.of(jobs).samples))
         or _has_installed_adapters()
     ):
         return
@@ -132,7 +140,8 @@ class _NoPandas:
         return None
 
 
-def _uses_python_adapters(job: Job) -> bool:
+def uses_python_adapters(job: Job) -> bool:
+    """Return whether a job names adapters in Python."""
     from mosaico_ingest.job.fields import reference_of
 
     references = map(reference_of, (*job.adapters.load, *job.adapters.override.values()))

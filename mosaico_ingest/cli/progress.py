@@ -6,9 +6,9 @@ import sys
 import time
 from collections.abc import Callable, Generator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
+from msgspec import Struct, field
 from rich.console import Console, Group, RenderableType
 from rich.live import Live
 from rich.progress_bar import ProgressBar
@@ -45,8 +45,7 @@ MIN_ESTIMATE_S = 3.0
 """Seconds before the remaining time is estimated; earlier estimates are unreliable."""
 
 
-@dataclass(slots=True)
-class TopicTally:
+class TopicTally(Struct):
     """The messages of one topic so far."""
 
     expected: Expected
@@ -55,8 +54,7 @@ class TopicTally:
     rejected: int = 0
 
 
-@dataclass(slots=True)
-class RecordingTally:
+class RecordingTally(Struct):
     """The messages of one active recording so far."""
 
     start: RunStarted
@@ -90,8 +88,7 @@ class RecordingTally:
         return min(self.read / self.promised, 1.0) if self.promised else 0.0
 
 
-@dataclass(slots=True)
-class Tally:
+class Tally(Struct):
     """Progress of a batch of recordings, summed up from events."""
 
     sizes: Sequence[int]

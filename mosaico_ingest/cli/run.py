@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
-from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
 from operator import methodcaller
@@ -14,7 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Annotated, TypeVar
 
 import typer
-from msgspec import Struct
+from msgspec import Struct, field
 
 from mosaico_ingest.cli.options import (
     STANDARD_OUTPUT,
@@ -39,6 +38,8 @@ from mosaico_ingest.cli.process import (
     hide_pandas,
     interrupt_on_sigterm,
     set_up_logging,
+    set_up_worker,
+    uses_python_adapters,
 )
 from mosaico_ingest.errors import IngestError, ManifestError, SinkError
 from mosaico_ingest.job.values import IfExists
@@ -372,9 +373,10 @@ def run_tasks(
 
     as_json = log_format is LogFormat.JSON
     level = log or ("ERROR" if quiet else tasks[0].job.run.log_level if tasks else "INFO")
-    prepare = partial(set_up_logging, level, log_format)
-    prepare()
+    set_up_logging(level, log_format)
     batch = LazySequence.of(tasks)
+    python_adapters = any(uses_python_adapters(task.job) for task in batch.samples)
+    prepare = partial(set_up_worker, level, log_format, python_adapters=python_adapters)
     if log or quiet:
         batch = batch.map(methodcaller("with_log_level", level))
     interrupt_on_sigterm()
@@ -417,8 +419,7 @@ def run_tasks(
         raise typer.Exit(code)
 
 
-@dataclass(slots=True)
-class _Errors:
+class _Errors(Struct):
     """The errors of failed recordings."""
 
     first: list[RunFinished] = field(default_factory=list[RunFinished])
