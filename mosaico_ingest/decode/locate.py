@@ -247,6 +247,9 @@ def _same_length(lengths: Int64s) -> Iterator[Int64s]:
     """Yield the rows of each length that occurs at least `_MIN_GROUP` times."""
     if len(lengths) < _MIN_GROUP:
         return
+    if (lengths == lengths[0]).all():
+        yield np.arange(len(lengths))
+        return
     order = np.argsort(lengths, kind="stable")
     borders = np.flatnonzero(np.diff(lengths[order], prepend=-1, append=-1))
     for group in np.flatnonzero(np.diff(borders) >= _MIN_GROUP).tolist():

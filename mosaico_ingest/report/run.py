@@ -15,7 +15,6 @@ from functools import cached_property, reduce
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from textwrap import indent
 from typing import IO, Annotated, Any, Literal, TypeVar
 
 import msgspec
@@ -353,7 +352,7 @@ def report_text(report: RunReport, path: Path) -> Iterator[str]:
     yield start + _NO_RECORDINGS[:-1]
     separator = "\n"
     for recording in report.recordings:
-        yield separator + indent(recording.model_dump_json(indent=2), "    ")
+        yield separator + "    " + recording.model_dump_json(indent=2).replace("\n", "\n    ")
         separator = ",\n"
     yield ("]" if separator == "\n" else "\n  ]") + end + "\n"
 

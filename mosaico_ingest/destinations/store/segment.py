@@ -15,7 +15,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from xxhash import xxh3_128, xxh3_128_digest
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations.base import has_nested_lists, topic_schema
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.job.values import Compression
 from mosaico_ingest.lazy import cache_by_identity
@@ -519,6 +519,7 @@ class Columns:
         self.leaves = leaves_of(schema)
         """The columns in the order of Parquet's column numbers."""
         self.makers = column_makers(schema)
+        self.has_nested_lists = has_nested_lists(schema)
         self._options_of_few_rows = options_of_few_rows(self.leaves)
 
     def writer_options(self, rows: pa.Table, compression: Compression = Compression.FAST) -> dict[str, Any]:

@@ -25,7 +25,6 @@ from mosaico_ingest.destinations.base import (
     StoredTopic,
     check_batch,
     check_same_type,
-    has_nested_lists,
     replacement_is_incomplete,
     with_offsets,
 )
@@ -199,7 +198,6 @@ class StoreTopic:
         self.metadata = metadata
         self._columns = columns_of(ontology)
         self.schema = self._columns.schema
-        self._has_nested_lists = has_nested_lists(self.schema)
         self.created_ns = time.time_ns()
         self.buffered_bytes = 0
         self.segments: list[Segment] = []
@@ -219,7 +217,7 @@ class StoreTopic:
         check_batch(batch, self.schema, where=self.name)
         if not batch.num_rows:
             return
-        if self._has_nested_lists:
+        if self._columns.has_nested_lists:
             batch = with_offsets(batch)
         if self._staging.writers is not None:
             self._staging.writers.check()

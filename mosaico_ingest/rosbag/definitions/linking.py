@@ -10,6 +10,7 @@ import pyarrow as pa
 from msgspec.structs import replace
 
 from mosaico_ingest.errors import BagError, DecodeError
+from mosaico_ingest.lazy import cache_by_identity
 from mosaico_ingest.rosbag.definitions.model import (
     BYTES,
     HEADER,
@@ -74,6 +75,7 @@ def link(
     return linked
 
 
+@cache_by_identity
 def ros_shape(definition: Definition) -> pa.StructType:
     """Return the Arrow type of a message's rows. All fields are nullable; constants are not columns.
 

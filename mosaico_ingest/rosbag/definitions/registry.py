@@ -206,6 +206,10 @@ class TypeResolver:
         return self._resolved[key]
 
     def _resolve(self, root: str, embedded: Embedded | None, version: int) -> Definition:
+        if embedded is not None and not (self._custom or self._registered or self.distro):
+            definition = _complete_definition(root, embedded, version)
+            if definition is not None:
+                return definition
         sources = self._sources(root, embedded, version)
         entry = next(
             ((message, candidate.source) for candidate in sources if (message := candidate.find(root))), None
@@ -505,6 +509,22 @@ class _TypeSource(Struct, frozen=True):
     label: str
     source: Source
     find: Callable[[str], MessageType | None]
+
+
+@lru_cache(maxsize=1024)
+def _complete_definition(root: str, embedded: Embedded, version: int) -> Definition | None:
+    """Return the definition in an embedded text that defines all nested types, None for any other text.
+
+    The recordings of a fleet embed the same texts. They share one definition, so that its shape is computed once, too.
+    """
+    if embedded.encoding.lower() not in _LANGUAGES or _is_empty(embedded.text):
+        return None
+    try:
+        named = {**BUILTIN, **read_types(embedded.text, root)}
+        types = link(named[root], named.get, ros_version=version, hint="")
+    except (BagError, KeyError):
+        return None
+    return Definition(root, types, Source.BAG, flatten(root, types, ros_version=version), version)
 
 
 def _is_empty(text: str) -> bool:

@@ -73,9 +73,8 @@ def as_stamp(refuse: RejectRows, t: Array) -> Array:
     absent = null_mask(t)
     if sec.null_count or nanosec.null_count:
         sec, nanosec = _complete_parts(refuse, sec, nanosec, absent)
-    over = true_mask(pc.greater_equal(nanosec, SECOND_NS))
-    if nanosec.type != arrays.uint32():
-        over |= true_mask(pc.less(nanosec, 0))
+    values = np.asarray(nanosec)
+    over = (values >= SECOND_NS) | (values < 0)
     if over.any():
         refuse(over, "nanosec", lambda i: f"nanosec is {nanosec[i]}, it must be below 1e9 and not negative")
         nanosec = set_null(nanosec, over)
@@ -238,11 +237,16 @@ def as_header(refuse: RejectRows, h: Array, *, collapse: bool = True) -> Array:
 
 
 def _is_empty(stamp: Array, frame: Array) -> Mask:
-    unnamed = true_mask(pc.equal(pc.binary_length(frame), 0), null=True)
-    if not unnamed.any():
-        return unnamed
-    zero = [true_mask(pc.equal(part, 0), null=True) for part in stamp_parts(stamp)]
-    return unnamed & zero[0] & zero[1]
+    empty = _is_zero(pc.binary_length(frame))
+    if empty.any():
+        for part in stamp_parts(stamp):
+            empty &= _is_zero(part)
+    return empty
+
+
+def _is_zero(values: Array) -> Mask:
+    """Return which integers are zero or null."""
+    return np.asarray(pc.fill_null(values, 0) if values.null_count else values) == 0
 
 
 @function(HEADER, returns=HEADER_TYPE)
