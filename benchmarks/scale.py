@@ -1,6 +1,7 @@
 """Measure inputs of unusual proportions: CPU time, peak memory and the number of stored rows.
 
-    ./dev bench scale            10^6 messages on a topic, 5,000 topics, 10,000 splits, 10^5 sequences and recordings
+    ./dev bench scale            10^6 messages on a topic, 5,000 topics, 10,000 splits, 50 GB by range,
+                                 10^5 sequences and recordings
     ./dev bench scale --small    a hundredth of that, as in the tests
 
 Each case fails if a message is missing.
@@ -19,6 +20,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from measure import Sample, run
+from sparse import recording, served
 
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.job.values import Stores
@@ -32,6 +34,8 @@ START_NS = 1_700_000_000_000_000_000
 REPORT = "report.jsonl"
 SMALL = 100
 """The divisor of `--small`."""
+MAX_SENT_BYTES = 1 << 20
+"""Maximum number of bytes that ingesting one topic of the sparse recording may read."""
 
 
 @dataclass(frozen=True)
@@ -61,12 +65,12 @@ def write(path: Path, topics: int, messages: int, start: int = 0) -> None:
     writer.finish()
 
 
-def ingest(folder: Path, path: str, expected: int, name: str, *options: str) -> Figures:
+def ingest(folder: Path, path: str, expected: int, name: str, *options: str, settings: str = "") -> Figures:
     """Ingest the recordings of a pattern, and check the number of stored rows."""
     job, report = folder / "job.yaml", folder / REPORT
     job.write_text(
         f'version: 1\nbag: {{path: "{path}"}}\nsequence: {{name: "{{stem}}", if_exists: skip}}\n'
-        "target: {store: store}\n"
+        f"target: {{store: store}}\n{settings}"
     )
     sample = run([*INGEST, "run", job, "--quiet", "--report", report, *options])
     rows = read_report(report).summary.written
@@ -94,6 +98,18 @@ def many_splits(folder: Path, divisor: int) -> Figures:
     for split in range(count):
         write(folder / f"drive/drive_{split}.mcap", 1, 1, start=split)
     return ingest(folder, "drive", count, f"{count:,} splits x 1 message")
+
+
+def sparse_recording(folder: Path, divisor: int) -> Figures:
+    """Ingest one topic of a recording of 50 GB behind a URL, whose other topic has all bytes but a few."""
+    chunks = 100 if divisor == 1 else 10
+    file = recording(chunks, 500_000_000 * 100 // divisor // chunks)
+    with served(file) as url:
+        name = f"{file.size / 1e9:.1f} GB by range, 1 topic"
+        figures = ingest(folder, url, chunks, name, settings="topics: [/small]\n")
+    assert file.sent_bytes < MAX_SENT_BYTES, f"{name}: {file.sent_bytes:,} bytes were read"
+    print(f"{name}: {file.sent_bytes:,} bytes were read", file=sys.stderr)
+    return figures
 
 
 def many_sequences(folder: Path, divisor: int) -> Figures:
@@ -135,6 +151,7 @@ CASES: tuple[Callable[[Path, int], Figures], ...] = (
     one_topic,
     many_topics,
     many_splits,
+    sparse_recording,
     many_sequences,
     many_recordings,
 )

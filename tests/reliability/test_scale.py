@@ -1,4 +1,4 @@
-"""Inputs of unusual proportions: many messages, topics, splits, sequences and recordings, a hundredth of the benchmark."""
+"""Inputs of unusual proportions: many messages, topics, splits, bytes, sequences and recordings, a hundredth of the benchmark."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ def test_benchmark_of_scale_stores_every_row_in_little_memory() -> None:
         "1 topic x 10,000 messages": "10,000",
         "50 topics x 10 messages": "500",
         "100 splits x 1 message": "100",
+        "0.5 GB by range, 1 topic": "10",
         "last page of 1,000 sequences": "10",
         "200 recordings": "200",
         "200 known recordings": "0",
