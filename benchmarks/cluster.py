@@ -19,8 +19,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from measure import run
-from mosaico_ingest.report.run import read_report
 from scale import INGEST, write
+
+from mosaico_ingest.report.run import read_report
 
 SUPPORT = Path(__file__).resolve().parents[1] / "tests/support"
 sys.path.insert(0, str(SUPPORT))
