@@ -19,6 +19,7 @@ INTERNAL = {
     "job.fields._MAX_COUNT": "a bound of a number",
     "job.yaml_source._MAX_RECOVERIES": "number of reported mistakes",
     "rosbag.blocks.MAX_GROUP_LENGTH": "size of batches",
+    "rosbag.blocks._MAX_ELEMENT_BYTES": "the choice of an algorithm",
     "rosbag.blocks._MAX_WORD_BYTES": "the choice of an algorithm",
     "rosbag.compression._MAX_BUFFER_BYTES": "size of batches",
     "rosbag.definitions.model._MAX_SIZE": "a bound of a number",
