@@ -266,9 +266,12 @@ def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:
         IngestError: A recording of one of them cannot be planned.
     """
     from mosaico_ingest.pipeline.plan_document import differences
-    from mosaico_ingest.pipeline.preview import decide
+    from mosaico_ingest.pipeline.run import make_plan
 
-    plans = ([decide(job, folder=Path()) for job in compile_job(manifest)] for manifest in (before, after))
+    plans = (
+        [make_plan(Task(job)).document(folder=Path()) for job in compile_job(manifest)]
+        for manifest in (before, after)
+    )
     return differences(*plans)
 
 
@@ -281,11 +284,11 @@ def compile_plan(path: Path) -> tuple[Task, ...]:
     """
     from mosaico_ingest.pipeline.plan import digest_of
     from mosaico_ingest.pipeline.plan_document import differences, read_plan
-    from mosaico_ingest.pipeline.preview import decide
+    from mosaico_ingest.pipeline.run import make_plan
 
     document = read_plan(path)
     jobs = compile_job(path.parent / document.job)
-    current = [decide(job, folder=job.folder) for job in jobs]
+    current = [make_plan(Task(job)).document(folder=job.folder) for job in jobs]
     drift = differences([recording.plan for recording in document.recordings], current)
     if drift:
         raise IngestError(

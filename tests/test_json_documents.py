@@ -15,9 +15,10 @@ from hypothesis import strategies as st
 from pydantic import BaseModel, ValidationError
 
 from mosaico_ingest import api
+from mosaico_ingest.documents import document_schema
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.config import ROSInjectionConfig
-from mosaico_ingest.pipeline.plan_document import PlanDocument, plan_schema, read_plan
+from mosaico_ingest.pipeline.plan_document import PlanDocument, read_plan
 from mosaico_ingest.report.run import RunReport, read_report, report_schema
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -26,7 +27,7 @@ DRIVE = ROOT / "configs" / "quickstart" / "drive.mcap"
 Document: TypeAlias = dict[str, Any]
 DocumentPath: TypeAlias = tuple[str | int, ...]
 MODELS: dict[str, type[BaseModel]] = {"plan": PlanDocument, "report": RunReport}
-SCHEMAS = {"plan": plan_schema(), "report": report_schema()}
+SCHEMAS = {"plan": document_schema(PlanDocument), "report": report_schema()}
 READERS: dict[str, Callable[[Path], object]] = {"plan": read_plan, "report": read_report}
 COMPUTED = {"totals", "compression", "rate_hz", "exit_code"}
 """Fields that the models compute and ignore when a file is read."""

@@ -9,6 +9,7 @@ import shutil
 from collections.abc import Callable, Generator, Iterator, Sequence
 from contextlib import contextmanager
 from enum import Enum
+from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -358,17 +359,18 @@ def _ci_files(manifest: Path, junit: Path | None, sarif: Path | None) -> Generat
 
 
 def _schema_text(document: Document) -> str:
-    from mosaico_ingest.pipeline.definition_changes import lock_schema
-    from mosaico_ingest.pipeline.plan_document import plan_schema
+    from mosaico_ingest.documents import document_schema
+    from mosaico_ingest.pipeline.definition_changes import LockDocument
+    from mosaico_ingest.pipeline.plan_document import PlanDocument
     from mosaico_ingest.report.run import report_schema
     from mosaico_ingest.services.schemas import adapter_editor_schema, job_editor_schema
 
     schemas: dict[Document, Callable[[], dict[str, Any]]] = {
         Document.JOB: job_editor_schema,
         Document.ADAPTER: adapter_editor_schema,
-        Document.PLAN: plan_schema,
+        Document.PLAN: partial(document_schema, PlanDocument),
         Document.REPORT: report_schema,
-        Document.LOCK: lock_schema,
+        Document.LOCK: partial(document_schema, LockDocument),
     }
     return json.dumps(schemas[document](), indent=2, ensure_ascii=False) + "\n"
 

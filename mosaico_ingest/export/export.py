@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import closing, suppress
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path, PurePath
 from typing import Any
 
@@ -136,7 +137,9 @@ class Origin(Struct, frozen=True):
         Raises:
             BagError: The text is not a valid definition.
         """
-        entry = next(one for one in MESSAGE_ENCODINGS.values() if one.language is self.language)
+        entry = next(
+            encoding for encoding in MESSAGE_ENCODINGS.values() if encoding.language is self.language
+        )
         if entry.read_schema is not None:
             schema = Embedded(entry.schema_encoding, self.text) if self.text else None
             return entry.read_schema(self.msgtype, schema)
@@ -246,7 +249,7 @@ def restorer_for(info: SourceTopic, definition: Definition, specs: Sequence[Adap
     shape = ros_shape(definition)
     mismatches: list[str] = []
     candidates = _candidates(info, definition, specs)
-    for spec in (one for candidate in candidates for one in outputs_of(candidate) or (candidate,)):
+    for spec in chain.from_iterable(outputs_of(candidate) or (candidate,) for candidate in candidates):
         try:
             adapter = spec.bind(definition, shape)
         except AdapterError as error:
@@ -359,7 +362,9 @@ def export_sequence(
     specs = [adapter_spec(reference, Path()) for reference in adapters]
     candidates = restorers_of(opened, topics, definitions, specs=specs, versions=ROS_VERSIONS[path.suffix])
     if dry_run:
-        results = [one.result() if isinstance(one, Restorer) else one for one in candidates]
+        results = [
+            candidate.result() if isinstance(candidate, Restorer) else candidate for candidate in candidates
+        ]
         return _logged(ExportReport(sequence=sequence, path=str(path), bytes=0, topics=tuple(results)))
     with open_writer(path, replace=replace) as writer:
         restorers: list[tuple[int, Restorer]] = []

@@ -86,7 +86,7 @@ class StoreSequence:
         self.name = info.name
         self.metadata = info.metadata
         self.attachments = info.attachments
-        self.topics = tuple(SourceTopic(one.name, one.ontology, one.metadata) for one in info.topics)
+        self.topics = tuple(SourceTopic(topic.name, topic.ontology, topic.metadata) for topic in info.topics)
         self.bounds = info.start_ns or 0, info.end_ns or 0
 
     def rows(

@@ -14,7 +14,6 @@ from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract
 from mosaico_ingest.contracts.monitor import BlockObserver, RecordingMonitor, summary
-from mosaico_ingest.contracts.times import FileOrder
 from mosaico_ingest.decode.decoder import decoder_for
 from mosaico_ingest.destinations.base import AmendableSession, Session, destination_of
 from mosaico_ingest.errors import AdapterError, ContractError
@@ -27,7 +26,6 @@ from mosaico_ingest.pipeline.provenance import SequenceRequest
 from mosaico_ingest.pipeline.selection import bind_conditions, row_selector, row_times
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.pipeline.topic import TopicPipeline, pipelines_by_connection
-from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.events import ContractEvaluated, Noted, Observer
 from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Outcome
 from mosaico_ingest.rosbag.blocks import Connection, Int64s, MessageBlock
@@ -62,11 +60,6 @@ class ContractRun(Struct, frozen=True):
             return None
         attach_monitor(monitor, pipelines_by_connection(topics))
         return cls(plan, monitor, tuple(topic for topic in topics if not topic.plan.shares_messages))
-
-    @property
-    def order(self) -> FileOrder | None:
-        """The observer of the order in the files, if an expectation needs it."""
-        return self.monitor.order
 
     def observe_order(self, split: int, connection: int, block: MessageBlock) -> None:
         """Observe the messages of the time range in the order of the files."""
@@ -144,7 +137,7 @@ def check_group(plan: Plan) -> None:
 
 def contract_error(result: ContractResult) -> ContractError:
     """Return the error for a violated contract."""
-    findings = tuple(finding for one in result.errors if (finding := one.finding) is not None)
+    findings = tuple(finding for error in result.errors if (finding := error.finding) is not None)
     first = findings[0]
     count = len(findings)
     text = first.message if count == 1 else f"{count} expectations failed; the first: {first.message}"
@@ -159,9 +152,9 @@ def contract_error(result: ContractResult) -> ContractError:
 def _report(result: ContractResult, observe: Observer, *, as_warnings: bool) -> None:
     """Report failed expectations, and those whose violations are explained."""
     errors = set() if as_warnings else set(result.errors)
-    for one in result.results:
-        finding = one.finding
-        if finding is None or one in errors or finding.rule == "expectation-skipped":
+    for each in result.results:
+        finding = each.finding
+        if finding is None or each in errors or finding.rule == "expectation-skipped":
             continue
         if finding.severity is Severity.ERROR:
             finding = replace(finding, severity=Severity.WARNING)
@@ -186,8 +179,7 @@ def index_results(plan: Plan, recording: Recording) -> list[ExpectationResult]:
     topics = tuple(key for topic in plan.read_topics for key in topic.connections)
     observed = [key for key in topics if monitor.observer(key) is not None]
     times = None
-    is_remote = any(isinstance(path, RemotePath) for path in recording.files)
-    if not is_remote:  # the times of a remote file cost a request per chunk
+    if not recording.is_remote:  # the times of a remote file cost a request per chunk
         times = recording.index_times(observed, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
     if times is None:
         monitor = monitor_of(plan.replace(topics=()), recording)

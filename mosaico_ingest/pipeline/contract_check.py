@@ -38,7 +38,7 @@ def check_contract(job: Job, group: tuple[ExpectationResult, ...] = ()) -> Contr
             "the manifest has no data contract", where=job.origin.file, hint="add the section expect"
         )
     with open_job(job) as (recording, resolver):
-        has_definitions = all(one.definition is not None for one in recording.connections)
+        has_definitions = all(connection.definition is not None for connection in recording.connections)
         if has_definitions and needs_times_only(job):
             return _check_times(contract, recording)
         from mosaico_ingest.pipeline.contract import check_messages  # noqa: PLC0415 - log times need no decoder
@@ -68,9 +68,11 @@ def needs_times_only(job: Job) -> bool:
 
 def _check_times(contract: Contract, recording: Recording) -> ContractResult:
     """Return the results of a contract of log times, without deciding how the messages are converted."""
-    topics = [ReadTopic(one.topic, (one.id,)) for one in recording.connections]
+    topics = [ReadTopic(connection.topic, (connection.id,)) for connection in recording.connections]
     monitor = RecordingMonitor(contract, recording, topics)
-    ids = [one.id for one in recording.connections if monitor.observer(one.id) is not None]
+    ids = [
+        connection.id for connection in recording.connections if monitor.observer(connection.id) is not None
+    ]
     times = recording.index_times(ids)
     if times is not None:
         add_times(monitor, times)
@@ -84,10 +86,10 @@ def _check_times(contract: Contract, recording: Recording) -> ContractResult:
 
 def add_times(monitor: RecordingMonitor, times: Mapping[int, Int64s]) -> None:
     """Add all log times of some connections."""
-    for key, of_connection in times.items():
-        observer = monitor.observer(key)
+    for connection, log_times in times.items():
+        observer = monitor.observer(connection)
         if observer is not None:
-            observer.block(of_connection)
+            observer.block(log_times)
 
 
 def add_group_results(tasks: Sequence[Task], present: Callable[[], Sequence[Job]] = tuple) -> list[Task]:

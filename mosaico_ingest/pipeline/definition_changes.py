@@ -16,7 +16,7 @@ from pydantic import Field
 from mosaico_ingest.adapters.adapter import recorded_schema
 from mosaico_ingest.destinations.base import destination_of
 from mosaico_ingest.display import counted
-from mosaico_ingest.documents import Part, document_schema, read_document
+from mosaico_ingest.documents import Part, read_document
 from mosaico_ingest.errors import ContractError, IngestError
 from mosaico_ingest.findings import Finding, Severity, Span
 from mosaico_ingest.job.values import LockFile, OnSchemaChange
@@ -99,11 +99,6 @@ class LockDifference(Struct, frozen=True):
         return f"{self.topic}: {self.change.value} {self.text}"
 
 
-def lock_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a lock file."""
-    return document_schema(LockDocument)
-
-
 def read_lock(file: LockFile) -> LockDocument:
     """Parse a lock file.
 
@@ -150,9 +145,9 @@ def merge_locks(locks: Sequence[tuple[str, LockDocument]]) -> LockDocument:
                     definition=key, required=all(name in other.topics for _, other in locks)
                 )
                 continue
-            first, reference = owners[name]
+            owner, reference = owners[name]
             for difference in _topic_differences(name, reference, lock):
-                message = f"{difference}, in {recording} compared with {first}"
+                message = f"{difference}, in {recording} compared with {owner}"
                 findings.append(Finding("definition-difference", Severity.ERROR, message))
     if findings:
         raise ContractError(
@@ -171,15 +166,18 @@ def check_lock(file: LockFile, actual: LockDocument, *, recording: str) -> None:
         ManifestError: The text is not a lock file.
     """
     differences = lock_differences(read_lock(file), actual)
-    first = next(iter(differences), None)
-    if first is None:
+    if not differences:
         return
+    first = differences[0]
     source = load_source(file.text, file=file.path)
     findings = tuple(
         Finding(
-            "definition-difference", Severity.ERROR, str(one), _span(source.spans, source.key_spans, one.path)
+            "definition-difference",
+            Severity.ERROR,
+            str(difference),
+            _span(source.spans, source.key_spans, difference.path),
         )
-        for one in differences
+        for difference in differences
     )
     more = f" (and {counted(len(differences) - 1, 'more difference')})" if len(differences) > 1 else ""
     raise ContractError(
@@ -227,8 +225,10 @@ def _types_of(definitions: Sequence[Definition]) -> dict[str, tuple[str, ...]]:
     lines: dict[str, tuple[str, ...]] = {}
     for definition in definitions:
         for name in _used_types(definition):
-            own = tuple(spell(definition.types[name]).splitlines())
-            lines[_definition_key({key: {"": value} for key, value in lines.items()}, name, {"": own})] = own
+            text = tuple(spell(definition.types[name]).splitlines())
+            lines[_definition_key({key: {"": value} for key, value in lines.items()}, name, {"": text})] = (
+                text
+            )
     return dict(sorted(lines.items()))
 
 
@@ -384,7 +384,7 @@ def _column_differences(
 def _span(spans: Mapping[KeyPath, Span], key_spans: Mapping[KeyPath, Span], path: KeyPath) -> Span | None:
     """Return the span of the key or list item at a path, or of the nearest entry around it."""
     around = (path[:length] for length in range(len(path), 0, -1))
-    return next(filter(None, (key_spans.get(one) or spans.get(one) for one in around)), None)
+    return next(filter(None, (key_spans.get(entry) or spans.get(entry) for entry in around)), None)
 
 
 class _StoredDefinition(Struct, frozen=True):
@@ -414,13 +414,13 @@ def follow_schema_changes(plan: Plan, action: OnSchemaChange) -> Plan:
         history = stored.get(check_topic_name(topic.target), [])
         reference = history[:1] if action is OnSchemaChange.NEW_TOPIC else history[-1:]
         text = _definition(topic.metadata)
-        changed = next((one for one in reference if text is not None and one.text != text), None)
-        if changed is None or text is None:
+        earlier = next((definition for definition in reference if definition.text != text), None)
+        if earlier is None or text is None:
             topics.append(topic)
             continue
         target = _versioned_name(topic.target, text) if action is OnSchemaChange.NEW_TOPIC else topic.target
         topics.append(topic.replace(target=target))
-        findings.append(_finding(topic, changed, text, action, target))
+        findings.append(_finding(topic, earlier, text, action, target))
     if findings and action is OnSchemaChange.FAIL:
         raise IngestError(
             f"{len(findings)} message definitions have changed; the first: {findings[0].message}",

@@ -13,7 +13,7 @@ from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from mosaico_ingest.display import count_text
-from mosaico_ingest.documents import Part, document_schema, html_table, read_document, read_limited
+from mosaico_ingest.documents import Part, html_table, read_document, read_limited
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.findings import Finding, Severity, Stage
 from mosaico_ingest.pipeline.plan import Plan, plan_headline
@@ -206,11 +206,6 @@ def read_plan(path: Path) -> PlanDocument:
     return read_document(content, PlanDocument, where=str(path), kind="a plan", hint=hint)
 
 
-def plan_schema() -> dict[str, Any]:
-    """Return the JSON Schema (draft 2020-12) of a plan file."""
-    return document_schema(PlanDocument)
-
-
 def _count_text(count: int | None) -> str:
     return "?" if count is None else count_text(count)
 
@@ -262,22 +257,22 @@ def differences(before: Sequence[PlanJson], after: Sequence[PlanJson]) -> tuple[
 def _pairs(
     before: Sequence[PlanJson], after: Sequence[PlanJson]
 ) -> Iterator[tuple[PlanJson | None, PlanJson | None]]:
-    rest = list(after)
+    candidates = list(after)
     unpaired: list[PlanJson] = []
     for old in before:
-        new = next((plan for plan in rest if _sequence(plan) == _sequence(old)), None)
+        new = next((plan for plan in candidates if _sequence(plan) == _sequence(old)), None)
         if new is None:
             unpaired.append(old)
             continue
-        rest.remove(new)
+        candidates.remove(new)
         yield old, new
     for old in unpaired:
-        same = [plan for plan in rest if plan["files"] == old["files"]]
-        new = same[0] if same else rest[0] if len(rest) == len(unpaired) == 1 else None
+        same = [plan for plan in candidates if plan["files"] == old["files"]]
+        new = same[0] if same else candidates[0] if len(candidates) == len(unpaired) == 1 else None
         if new is not None:
-            rest.remove(new)
+            candidates.remove(new)
         yield old, new
-    yield from ((None, new) for new in rest)
+    yield from ((None, new) for new in candidates)
 
 
 def _sequence(plan: PlanJson) -> str:

@@ -453,8 +453,8 @@ def _misfit(job: Job, misfits: list[tuple[str, AdapterError]]) -> AdapterError:
         glob = first_match(job.adapters.override, topic)
         span = None if glob is None else job.span("adapters", "override", glob)
         message = f"{error.where}: {error.what}" if error.where else error.what
-        own = Finding("type-mismatch", Severity.ERROR, message, span, error.hint)
-        findings.update(dict.fromkeys(error.findings or (own,)))
+        mismatch = Finding("type-mismatch", Severity.ERROR, message, span, error.hint)
+        findings.update(dict.fromkeys(error.findings or (mismatch,)))
     first = misfits[0][1]
     more = f" (and {len(misfits) - 1} more topics)" if len(misfits) > 1 else ""
     return AdapterError(f"{first.what}{more}", where=first.where, hint=first.hint, findings=tuple(findings))

@@ -7,7 +7,6 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from os.path import relpath
 from pathlib import Path
-from typing import Any
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -44,7 +43,6 @@ from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.pipeline.topic import TopicPipeline, link_outputs, pipelines_by_connection
 from mosaico_ingest.pipeline.write_buffer import WriteBuffer
 from mosaico_ingest.protocol import check_topic_name
-from mosaico_ingest.remote import RemotePath
 from mosaico_ingest.report.events import Event, Rejected
 from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.blocks import MessageBlock
@@ -155,9 +153,9 @@ class _Rejections:
 
     def __call__(self, event: Event) -> None:
         if isinstance(event, Rejected):
-            first = self.by_rule.get(event.rule)
+            earlier = self.by_rule.get(event.rule)
             self.by_rule[event.rule] = (
-                event if first is None else replace(first, count=first.count + event.count)
+                event if earlier is None else replace(earlier, count=earlier.count + event.count)
             )
 
 
@@ -186,7 +184,7 @@ def _counts(plan: Plan, recording: Recording) -> Mapping[int, int | None]:
     if plan.read_from_ns is None and plan.read_until_ns is None:
         return {connection.id: connection.count for connection in recording.connections}
     connections = [connection for topic in plan.read_topics for connection in topic.connections]
-    is_indexed = not plan.selects_after_reading and not any(isinstance(p, RemotePath) for p in plan.files)
+    is_indexed = not plan.selects_after_reading and not recording.is_remote
     times = (
         recording.index_times(connections, start_ns=plan.read_from_ns, end_ns=plan.read_until_ns)
         if is_indexed  # behind a URL, the index takes one request per chunk
@@ -226,8 +224,7 @@ def _blocks(
 def _sample_blocks(
     plan: Plan, recording: Recording, pipelines: Mapping[int, TopicPipeline], *, enough: int
 ) -> Iterator[MessageBlock]:
-    is_remote = any(isinstance(path, RemotePath) for path in recording.files)
-    remaining_bytes = _REMOTE_SAMPLE_BYTES if is_remote else _SAMPLE_BYTES
+    remaining_bytes = _REMOTE_SAMPLE_BYTES if recording.is_remote else _SAMPLE_BYTES
     deadline = time.monotonic() + _SAMPLE_S
     memory_bytes = min(remaining_bytes, _MEMORY_BYTES)
     blocks = recording.message_blocks(
@@ -284,10 +281,14 @@ def _all_of(errors: Sequence[IngestError], count: int) -> IngestError:
         for error in errors
         for finding in error.findings or (Finding("plan-failed", Severity.ERROR, str(error)),)
     ]
-    one = min(errors, key=lambda error: error.exit_code)
-    one.what, one.where, one.hint = f"{len(errors)} of {count} recordings cannot be ingested", None, None
-    one.findings = tuple(dict.fromkeys(findings))
-    return one
+    error = min(errors, key=lambda error: error.exit_code)
+    error.what, error.where, error.hint = (
+        f"{len(errors)} of {count} recordings cannot be ingested",
+        None,
+        None,
+    )
+    error.findings = tuple(dict.fromkeys(findings))
+    return error
 
 
 def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = ()) -> RecordingPlan:
@@ -324,25 +325,10 @@ def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = (
                 *_chosen(job, plan),
                 *_excluded(plan),
                 *destination_findings,
-                *_violations(results),
+                *(finding for result in results if (finding := result.finding) is not None),
             )
         ),
     )
-
-
-def decide(job: Job, *, folder: Path) -> dict[str, Any]:
-    """Open the recording and return its plan as a document; paths are relative to `folder`.
-
-    Raises:
-        IngestError: The job cannot be done; the message states the reason.
-    """
-    bridge = ROSBridge.for_job(job)
-    with open_job(job) as (recording, resolver):
-        return plan_recording(Task(job), recording, bridge=bridge, resolver=resolver).document(folder=folder)
-
-
-def _violations(results: Iterable[ExpectationResult]) -> Iterator[Finding]:
-    return (finding for result in results if (finding := result.finding) is not None)
 
 
 def _unreadable(recording: Recording) -> Iterator[Finding]:

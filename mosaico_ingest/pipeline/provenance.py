@@ -102,7 +102,9 @@ class Provenance(_Part):
     def same_content(self, other: Provenance) -> bool:
         """Return whether both were made from the same bytes, regardless of file names."""
         pairs = zip(self.sources, other.sources, strict=False)
-        return len(self.sources) == len(other.sources) and all(one.same_content(two) for one, two in pairs)
+        return len(self.sources) == len(other.sources) and all(
+            source.same_content(source_of_other) for source, source_of_other in pairs
+        )
 
 
 class StoredProvenance(_Part):
@@ -290,9 +292,10 @@ def add_doubtful_digests(
     doubtful = {
         source.content
         for source in provenance.sources
-        if any(one.content == source.content and one.whole for one in stored_sources)
+        if any(entry.content == source.content and entry.whole for entry in stored_sources)
         and all(
-            (one.content, one.modified_ns) != (source.content, source.modified_ns) for one in stored_sources
+            (entry.content, entry.modified_ns) != (source.content, source.modified_ns)
+            for entry in stored_sources
         )
     }
     return _add_full_digests(provenance, files, contents=doubtful) if doubtful else provenance
@@ -322,9 +325,12 @@ def _remove_earlier_attempt(plan: Plan, run: str) -> IfExists:
     existing = destination.find(plan.sequence.name)
     if existing is None:
         return plan.sequence.if_exists
-    own = [s.id for s in existing.sessions if any(record.run == run for record in _records([s.metadata]))]
-    if own and (
-        len(own) == len(existing.sessions) or not destination.delete_sessions(plan.sequence.name, own)
+    sessions = [
+        s.id for s in existing.sessions if any(record.run == run for record in _records([s.metadata]))
+    ]
+    if sessions and (
+        len(sessions) == len(existing.sessions)
+        or not destination.delete_sessions(plan.sequence.name, sessions)
     ):
         return IfExists.REPLACE
     return plan.sequence.if_exists
@@ -332,10 +338,10 @@ def _remove_earlier_attempt(plan: Plan, run: str) -> IfExists:
 
 def _records(metadata: Iterable[Mapping[str, Any]]) -> tuple[Provenance, ...]:
     records: list[Provenance] = []
-    for one in metadata:
-        if PROVENANCE_KEY in one:
+    for entry in metadata:
+        if PROVENANCE_KEY in entry:
             try:
-                records.append(Provenance.model_validate(one[PROVENANCE_KEY]))
+                records.append(Provenance.model_validate(entry[PROVENANCE_KEY]))
             except ValidationError:
                 continue
     return tuple(records)
@@ -426,7 +432,7 @@ def fingerprint(job: Job) -> str | None:
         return None
     if _changed_recently(states):
         return None
-    return _content_digest(parts)
+    return _parts_digest(parts)
 
 
 def is_fingerprinted(job: Job, files: Iterable[AnyPath]) -> bool:
@@ -435,7 +441,7 @@ def is_fingerprinted(job: Job, files: Iterable[AnyPath]) -> bool:
     return all(file in job.paths or file.parent in folders for file in files)
 
 
-def _content_digest(parts: Iterable[bytes]) -> str:
+def _parts_digest(parts: Iterable[bytes]) -> str:
     digest = xxh3_128()
     for part in parts:
         digest.update(len(part).to_bytes(8, "little"))

@@ -305,10 +305,10 @@ def _value(values: Values, position: int) -> Any:  # noqa: ANN401 - a number, te
     return None if is_null else values.data[position]
 
 
-def _equal(one: Any, other: Any) -> bool:  # noqa: ANN401 - numbers, texts, booleans or None
-    if one is None or other is None:
-        return one is other
-    return bool(one == other) or bool(one != one and other != other)  # noqa: PLR0124 - NaN differs from itself
+def _equal(value: Any, other: Any) -> bool:  # noqa: ANN401 - numbers, texts, booleans or None
+    if value is None or other is None:
+        return value is other
+    return bool(value == other) or bool(value != value and other != other)  # noqa: PLR0124 - NaN differs from itself
 
 
 def is_static(topic: str) -> bool:

@@ -9,7 +9,6 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct, field
 from msgspec.structs import replace
-from numpy.typing import NDArray
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.decode.decoder import Decoder, decoder_for
@@ -46,8 +45,8 @@ class _OutputRows(Struct, frozen=True):
     """The rows that one message block has in one topic of the sequence."""
 
     rows: pa.StructArray
-    log_times: NDArray[np.int64]
-    index: NDArray[np.int64]
+    log_times: Int64s
+    index: Int64s
     """The position of each row's message in the block."""
 
 
@@ -56,13 +55,13 @@ class _Converted(Struct, frozen=True):
 
     outputs: tuple[_OutputRows, ...]
     """The rows of the topic, and of the other outputs of its adapter."""
-    written: NDArray[np.int64]
+    written: Int64s
     """The messages with a row in any output, ascending."""
     rejections: tuple[_Rejection, ...]
     """In the order of the messages."""
-    dropped: Mapping[str, NDArray[np.int64]]
+    dropped: Mapping[str, Int64s]
     """Positions of the messages that each rule of `topic_settings` and the time range drops."""
-    fallbacks: NDArray[np.int64]
+    fallbacks: Int64s
     """Positions of the messages whose time is the log time, because they do not have the selected time."""
 
 
@@ -169,7 +168,9 @@ class TopicPipeline(Struct):
                 continue
             topic.count(block, end, converted, latched=latched)
             topic.report_rejections(
-                block, (one for one in converted.rejections if one.failure.row < end), quarantined
+                block,
+                (rejection for rejection in converted.rejections if rejection.failure.row < end),
+                quarantined,
             )
             topic.write(block, output, end, int(np.searchsorted(converted.written, end)), buffer)
         if fatal is not None:
@@ -240,11 +241,11 @@ class TopicPipeline(Struct):
         return _Converted(
             tuple(
                 _OutputRows(
-                    one.rows,
-                    stamps[one.index] if one.log_times is None else one.log_times,
-                    index[one.index],
+                    output.rows,
+                    stamps[output.index] if output.log_times is None else output.log_times,
+                    index[output.index],
                 )
-                for one in (adapted, *adapted.others)
+                for output in (adapted, *adapted.others)
             ),
             index[adapted.messages],
             tuple(rejections),
@@ -252,7 +253,7 @@ class TopicPipeline(Struct):
             fallbacks,
         )
 
-    def _envelope(self, block: MessageBlock, index: NDArray[np.int64]) -> Envelope:
+    def _envelope(self, block: MessageBlock, index: Int64s) -> Envelope:
         """Return the envelope of some messages of a block."""
         envelope = Envelope(
             self.plan.topic, self.plan.msgtype, block.log_times, block.publish_times, block.sequences
@@ -400,7 +401,7 @@ class TopicPipeline(Struct):
         buffer.put(self._writer, rows)
         self.stopwatch.lap(Step.WAIT)
 
-    def _fail(self, error: IngestError, written: int, block: MessageBlock, index: NDArray[np.int64]) -> None:
+    def _fail(self, error: IngestError, written: int, block: MessageBlock, index: Int64s) -> None:
         """Mark the topic as failed; raise if its error policy ends the run."""
         self.status, self.error = TopicStatus.FAILED, str(error)
         first = int(index[0])
@@ -496,7 +497,7 @@ class _Columns:
         self._schema = pa.schema([ENVELOPE, *kind])
         self._required = RequiredFields(kind)
 
-    def batch(self, log_times: NDArray[np.int64], rows: pa.StructArray) -> pa.RecordBatch:
+    def batch(self, log_times: Int64s, rows: pa.StructArray) -> pa.RecordBatch:
         """Return a batch of the timestamps and the rows' fields."""
         if rows.type != self.kind:  # the sink reports the difference
             return _Columns(rows.type).batch(log_times, rows)

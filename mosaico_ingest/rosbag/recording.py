@@ -154,6 +154,8 @@ class Recording:
         self._iterators: weakref.WeakSet[Generator[MessageBlock, None, None]] = weakref.WeakSet()
         self._unreadable: dict[UnreadableRange, None] = dict.fromkeys(unreadable)
         self.files: tuple[AnyPath, ...] = files.files
+        self.is_remote: bool = any(isinstance(file, RemotePath) for file in files.files)
+        """Whether a file is behind a URL, where reading the times of a message index takes one request per chunk."""
         self.metadata: Metadata | None = files.metadata
         """The content of the recording's `metadata.yaml`."""
         self.missing_files: tuple[AnyPath, ...] = files.missing
@@ -362,7 +364,7 @@ class Recording:
         """Return the number of threads that read ahead; ranges of a remote file are fetched in order, so it has one."""
         if self.size_bytes <= _SMALL_RECORDING_BYTES or pa.cpu_count() == 1:
             return 0
-        if any(isinstance(file, RemotePath) for file in self.files):
+        if self.is_remote:
             return 1
         return min(pa.cpu_count() - 1, _MAX_READERS)
 

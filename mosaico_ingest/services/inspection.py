@@ -144,8 +144,8 @@ def _topic(job: Job, connection: Connection, bridge: ROSBridge, rate_hz: float |
 def _rates(recording: Recording) -> dict[int, float | None]:
     """Return the rate of each connection according to the index, without reading messages."""
     connections = recording.connections
-    is_remote = any(isinstance(path, RemotePath) for path in recording.files)  # one request per chunk
-    times = None if is_remote else recording.index_times([one.id for one in connections])
+    # The times of a remote file cost a request per chunk.
+    times = None if recording.is_remote else recording.index_times([one.id for one in connections])
     if times is not None:
         return {key: mean_rate_hz(len(one), *_ends(one)) for key, one in times.items()}
     rates = dict[int, float | None].fromkeys(one.id for one in connections)

@@ -34,7 +34,7 @@ from mosaico_ingest.images import (
     run_length_depth,
 )
 from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
-from mosaico_ingest.view.rows import last_rows, nearest_row, rows_near
+from mosaico_ingest.view.rows import column_schema, last_rows, nearest_row, rows_near
 
 _GAP = 4
 """Pixels between the pictures of a contact sheet."""
@@ -305,9 +305,7 @@ def _frames_of_group(
 
 def _packets(av: ModuleType, topic: TopicInfo, start_ns: int, end_ns: int) -> Iterator[Any]:
     """Yield the packets from one time to another, both inclusive, and None, which lets a decoder return its last frames."""
-    name = topic.schema.names[0]
-    schema = pa.schema([topic.schema.field(name), topic.schema.field("data")])
-    for batch in scan(topic.segments, schema, Window(start_ns, end_ns + 1)):
+    for batch in scan(topic.segments, column_schema(topic, ["data"]), Window(start_ns, end_ns + 1)):
         for time_ns, value in zip(*batch.columns, strict=True):
             data = value.as_py()
             if data:  # an empty packet would end the stream

@@ -5,7 +5,7 @@ Row groups that contain no selected row are not read, so the time does not depen
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -50,14 +50,14 @@ def first_rows(
 
     `columns` are names of top-level columns; `timestamp_ns` is always the first column.
     """
-    schema = _schema(topic, columns)
+    schema = column_schema(topic, columns)
     batches: list[pa.RecordBatch] = []
-    rest = count
+    missing = count
     if count:
         for batch in scan(topic.segments, schema, Window(start_ns)):
-            batches.append(batch.slice(0, rest))
-            rest -= batches[-1].num_rows
-            if not rest:
+            batches.append(batch.slice(0, missing))
+            missing -= batches[-1].num_rows
+            if not missing:
                 break
     return pa.Table.from_batches(batches, schema)
 
@@ -66,7 +66,7 @@ def last_rows(
     topic: TopicInfo, count: int, *, columns: Sequence[str] | None = None, end_ns: int | None = None
 ) -> pa.Table:
     """Return the last `count` rows at or before `end_ns`, ordered by time."""
-    schema = _schema(topic, columns)
+    schema = column_schema(topic, columns)
     window = Window(_start_of_last(topic, count, end_ns), None if end_ns is None else end_ns + 1)
     batches: list[pa.RecordBatch] = []
     rows = 0
@@ -80,7 +80,7 @@ def last_rows(
 
 def sampled_rows(topic: TopicInfo, count: int, *, columns: Sequence[str] | None = None) -> pa.Table:
     """Return `count` rows at equal distances, including the first and the last one, ordered by time."""
-    schema = _schema(topic, columns)
+    schema = column_schema(topic, columns)
     positions = np.unique(np.linspace(0, topic.rows - 1, min(count, topic.rows)).round().astype(np.int64))
     tables = [schema.empty_table()]
     start = 0
@@ -94,7 +94,7 @@ def sampled_rows(topic: TopicInfo, count: int, *, columns: Sequence[str] | None 
 
 def rows_near(topic: TopicInfo, times_ns: Sequence[int], *, columns: Sequence[str] | None = None) -> pa.Table:
     """Return the row nearest to each time, without repetitions, ordered by time."""
-    schema = _schema(topic, columns)
+    schema = column_schema(topic, columns)
     groups = list(_row_groups(topic.segments))
     nearest = {_nearest(groups, at_ns, schema.names[0]) for at_ns in times_ns} - {None}
     tables = [schema.empty_table()]
@@ -115,7 +115,8 @@ def nearest_row(
     return rows[0] if rows else None
 
 
-def _schema(topic: TopicInfo, columns: Sequence[str] | None) -> pa.Schema:
+def column_schema(topic: TopicInfo, columns: Iterable[str] | None) -> pa.Schema:
+    """Return the schema of the timestamps and of some other columns, or of all columns for None."""
     if columns is None:
         return topic.schema
     names = dict.fromkeys([topic.schema.names[0], *columns])

@@ -21,7 +21,7 @@ from mosaico_ingest.findings import suggest_names
 from mosaico_ingest.ontology.registry import column_unit
 from mosaico_ingest.view.columns import Column, is_list, is_number, topic_columns
 from mosaico_ingest.view.pictures import require_suffix
-from mosaico_ingest.view.rows import first_rows
+from mosaico_ingest.view.rows import column_schema, first_rows
 
 MAX_ITEMS = 8
 """Items of a list that are plotted if the field does not select one."""
@@ -94,8 +94,7 @@ def read_series(
         ViewError: A field does not exist or has no numbers; the hint names existing ones.
     """
     series_fields = [field for name in fields for field in _expanded(topic, name)]
-    names = dict.fromkeys([topic.schema.names[0], *(field.column.name for field in series_fields)])
-    schema = pa.schema([topic.schema.field(name) for name in names])
+    schema = column_schema(topic, (field.column.name for field in series_fields))
     group = max(1, 2 * topic.rows // max(2, max_points))
     envelopes = [_Envelope(group) for _ in series_fields]
     for batch in scan(topic.segments, schema, Window(start_ns, end_ns)):

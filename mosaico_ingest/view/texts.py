@@ -18,6 +18,7 @@ from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.display import bytes_text, count_text, counted, time_text
 from mosaico_ingest.images.files import image_file_type
+from mosaico_ingest.view.rows import column_schema
 
 if TYPE_CHECKING:
     from mosaico_ingest.view.columns import ColumnStatistics
@@ -274,8 +275,7 @@ def log_lines(topic: TopicInfo) -> Iterator[LogLine]:
     fields = {"log": ["level", "name", "msg"], "diagnostics": ["status"], "text": ["data"]}.get(
         kind or "", []
     )
-    names = [topic.schema.names[0], *(name for name in fields if name in topic.schema.names)]
-    schema = pa.schema([topic.schema.field(name) for name in names])
+    schema = column_schema(topic, [name for name in fields if name in topic.schema.names])
     rows = 0
     for batch in scan(topic.segments, schema, Window()) if kind else ():
         for row in batch.slice(0, MAX_ROWS - rows).to_pylist():

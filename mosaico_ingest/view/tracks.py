@@ -14,6 +14,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.view.columns import Column, is_number, topic_columns
+from mosaico_ingest.view.rows import column_schema
 
 _EARTH_M = 6_371_008.8
 """Mean radius of the Earth in m."""
@@ -129,8 +130,7 @@ def _batches(topic: TopicInfo, source: _Source) -> Iterator[pa.RecordBatch]:
         *([source.status] if source.status else []),
         *([source.frame] if source.frame else []),
     ]
-    names = dict.fromkeys([topic.schema.names[0], *(column.name for column in columns)])
-    return scan(topic.segments, pa.schema([topic.schema.field(name) for name in names]), Window())
+    return scan(topic.segments, column_schema(topic, (column.name for column in columns)), Window())
 
 
 def _coordinates(batch: pa.RecordBatch, source: _Source) -> npt.NDArray[np.float64]:
@@ -184,7 +184,7 @@ def read_edges(topics: Iterable[TopicInfo]) -> list[FrameEdge]:
             continue
         nested = topic.ontology.tag == "FrameTransform"
         names = ["transforms"] if nested else ["header", "target_frame_id", "translation"]
-        schema = pa.schema([topic.schema.field(name) for name in (topic.schema.names[0], *names)])
+        schema = column_schema(topic, names)
         for batch in scan(topic.segments, schema, Window()):
             for parent, child, rows, translation in _batch_edges(batch, nested=nested):
                 edge = counts.get((parent, child))

@@ -16,6 +16,7 @@ from made_recordings import define, record
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
+from mosaico_ingest.documents import document_schema
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.pipeline.definition_changes import (
@@ -23,7 +24,6 @@ from mosaico_ingest.pipeline.definition_changes import (
     LockDocument,
     LockedTopic,
     lock_differences,
-    lock_schema,
 )
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
@@ -94,7 +94,7 @@ def test_lock_of_unchanged_recording_passes_plan_run_and_check(tmp_path: Path) -
 def test_lock_file_has_types_fields_and_columns_and_matches_its_schema(tmp_path: Path) -> None:
     make(tmp_path / "run.mcap", number=3)
     document = json.loads(lock(job(tmp_path)).read_text())
-    Draft202012Validator(lock_schema()).validate(document)
+    Draft202012Validator(document_schema(LockDocument)).validate(document)
     assert list(document["topics"]) == ["/number", "/pack"]
     assert document["topics"]["/pack"]["columns"] == {
         "voltage": "float", "cells": "int32", "first.level": "float",
@@ -259,7 +259,7 @@ def test_lint_invalid_lock_file_is_reported(tmp_path: Path) -> None:
 
 def test_schema_lock_without_manifest_prints_schema(capsys: pytest.CaptureFixture[str]) -> None:
     assert run_main("schema", "lock") == 0
-    assert json.loads(capsys.readouterr().out) == lock_schema()
+    assert json.loads(capsys.readouterr().out) == document_schema(LockDocument)
     assert run_main("schema", "lock", "--check") == 2
 
 
