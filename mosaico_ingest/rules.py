@@ -5,9 +5,16 @@ Each rule has a page, `docs/rules/<id>.md`. Lint, plan and run use the same ids;
 
 from __future__ import annotations
 
+from itertools import groupby
+from pathlib import Path
+
 from msgspec import Struct
 
 from mosaico_ingest.findings import Severity
+
+_PACKAGE = Path(__file__).parent
+_PAGE_FOLDERS = (_PACKAGE / "rule_pages", _PACKAGE.parent / "docs" / "rules")
+"""The folder of the pages in an installed wheel, and in a checkout."""
 
 _ERROR, _WARNING, _INFO = Severity.ERROR, Severity.WARNING, Severity.INFO
 
@@ -257,3 +264,25 @@ _BY_CODE = {rule.code: rule for rule in _TABLE}
 def find_rule(name: str) -> Rule | None:
     """Return the rule with this id or code, or None."""
     return RULES.get(name) or _BY_CODE.get(name)
+
+
+def page_of(rule: Rule) -> str:
+    """Return the documentation page of a rule as Markdown."""
+    folder = next(folder for folder in _PAGE_FOLDERS if folder.is_dir())
+    return (folder / f"{rule.id}.md").read_text(encoding="utf-8")
+
+
+def rule_index() -> str:
+    """Return a Markdown table of all rules for each group."""
+    tables = [
+        f"\n## {group}\n\n| code | rule | severity | problem |\n|---|---|---|---|\n{''.join(map(_row, rules))}"
+        for group, rules in groupby(RULES.values(), key=lambda rule: rule.group)
+    ]
+    return (
+        "# Rules\n\nAfter reading this page, you can look up a finding of lint, plan or run, or the reason of a rejected row. "
+        "`ingest lint --explain RULE` prints the same page.\n" + "".join(tables)
+    )
+
+
+def _row(rule: Rule) -> str:
+    return f"| {rule.code} | [{rule.id}]({rule.id}.md) | {rule.severity.value} | {rule.summary} |\n"

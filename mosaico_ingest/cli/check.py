@@ -329,8 +329,7 @@ def _lint_summary(report: LintReport) -> str:
 
 
 def _explanation(name: str) -> str:
-    from mosaico_ingest.lint.pages import page_of, rule_index
-    from mosaico_ingest.rules import RULES, find_rule
+    from mosaico_ingest.rules import RULES, find_rule, page_of, rule_index
 
     if name == "all":
         return rule_index()

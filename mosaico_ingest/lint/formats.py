@@ -13,8 +13,7 @@ from msgspec import Struct
 
 from mosaico_ingest.findings import Edit, Finding, Severity, Span, mask_credentials
 from mosaico_ingest.lint.engine import LintedFile, LintReport
-from mosaico_ingest.lint.pages import page_of
-from mosaico_ingest.rules import RULES, Rule
+from mosaico_ingest.rules import RULES, Rule, page_of
 from mosaico_ingest.version import __version__
 
 _COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}

@@ -12,7 +12,6 @@ import yaml
 from mosaico_ingest.adapters import python as base
 from mosaico_ingest.adapters.bridge import ROSBridge, load_adapter_reference
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.adapters.builtin_files import read_catalog, with_catalog
 from mosaico_ingest.job.model import AdapterSettings
 from mosaico_ingest.rosbag.blocks import ROSMessage
 
@@ -32,8 +31,7 @@ def _block(language: str) -> str:
     return block
 
 
-def test_adapters_page_table_matches_catalog() -> None:
-    assert with_catalog(PAGE, read_catalog()) == PAGE
+def test_adapters_page_names_every_built_in_adapter() -> None:
     assert all(f"| `{name}` |" in PAGE for name in BY_NAME)
 
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 import operator
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,6 @@ from mosaico_ingest.adapters.mapping.columns import ExprType
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import parse
 from mosaico_ingest.adapters.mapping.functions import SUBJECTS, functions, operators
-from mosaico_ingest.adapters.mapping.functions.reference import with_reference
 from mosaico_ingest.adapters.mapping.functions.ros import HEADER_TYPE, STAMP_TYPE
 from mosaico_ingest.ontology.registry import ontology_type
 
@@ -237,11 +235,6 @@ def test_ros_header_ros1_seq_becomes_sample_counter() -> None:
 def test_header_and_stamp_types_match_ontology() -> None:
     assert ontology_type("IMU").struct.field("header").type == HEADER_TYPE
     assert ontology_type("Time").struct == STAMP_TYPE
-
-
-def test_function_reference_page_is_up_to_date() -> None:
-    path = Path(__file__).parents[2] / "docs" / "mapping.md"
-    assert with_reference(path.read_text("utf-8")) == path.read_text("utf-8")
 
 
 def test_sum_overflow_rejects_row() -> None:

@@ -10,13 +10,12 @@ from pathlib import Path
 import pytest
 
 import mosaico_ingest
-from mosaico_ingest.lint import pages
+from mosaico_ingest import rules
 from mosaico_ingest.lint.documents import Document, Kind, kind_of
 from mosaico_ingest.lint.engine import lint_document
-from mosaico_ingest.lint.pages import page_of, rule_index
 from mosaico_ingest.lint.rules import CHECKS
 from mosaico_ingest.lint.settings import Settings
-from mosaico_ingest.rules import LINT_RULES, RULES, Rule, find_rule
+from mosaico_ingest.rules import LINT_RULES, RULES, Rule, find_rule, page_of
 
 PACKAGE = Path(mosaico_ingest.__file__).parent
 PAGES = PACKAGE.parent / "docs" / "rules"
@@ -140,15 +139,11 @@ def test_page_has_registered_heading_reason_and_fix(rule: Rule) -> None:
         assert examples(rule, "Good")
 
 
-def test_rule_index_is_up_to_date() -> None:
-    assert (PAGES / "README.md").read_text().endswith(rule_index())
-
-
 def test_page_of_installed_package_reads_packaged_pages(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "yaml-tag.md").write_text("packaged")
-    monkeypatch.setattr(pages, "_FOLDERS", (tmp_path, PAGES))
+    monkeypatch.setattr(rules, "_PAGE_FOLDERS", (tmp_path, PAGES))
     assert page_of(RULES["yaml-tag"]) == "packaged"
     assert '"docs/rules" = "mosaico_ingest/rule_pages"' in (PACKAGE.parent / "pyproject.toml").read_text()
 

@@ -9,8 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.ontology.columns_file import columns_file
-from mosaico_ingest.ontology.registry import COLUMNS_FILE, MODULES, model, ontology_type
+from mosaico_ingest.ontology.registry import MODULES, model, ontology_type
 
 GOLDEN: dict[str, list[str]] = json.loads(Path(__file__).with_name("fingerprints.json").read_text())
 
@@ -31,10 +30,6 @@ def test_columns_json_entry_matches_model(tag: str) -> None:
     known, result = ontology_type(tag), model(tag).ontology_type()
     assert known == result
     assert known.struct.equals(result.struct, check_metadata=True)
-
-
-def test_columns_json_is_up_to_date() -> None:
-    assert COLUMNS_FILE.read_text(encoding="utf-8") == columns_file(), "run ./dev docs"
 
 
 def test_ontology_columns_equal_reference(shared: Path) -> None:

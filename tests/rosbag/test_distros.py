@@ -5,8 +5,7 @@ from rosbags.typesys import Stores as RosbagsStores
 from rosbags.typesys import get_typestore
 
 from mosaico_ingest.job.values import Stores
-from mosaico_ingest.rosbag.definitions.distros_file import distros_file
-from mosaico_ingest.rosbag.definitions.registry import FILE, distro_type
+from mosaico_ingest.rosbag.definitions.registry import distro_type
 from mosaico_ingest.rosbag.definitions.rosbags_types import message_type
 
 
@@ -21,7 +20,3 @@ def test_distro_type_of_another_distro_is_none() -> None:
     assert distro_type(Stores.ROS1_NOETIC, "rcl_interfaces/msg/Log") is None
     assert distro_type(Stores.EMPTY, "std_msgs/msg/Header") is None
     assert distro_type(Stores.LATEST, "Header") is None
-
-
-def test_distros_file_is_up_to_date() -> None:
-    assert FILE.read_text(encoding="utf-8") == distros_file(), "run ./dev docs"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Iterator
 from enum import Enum
-from pathlib import Path
 from typing import Any, TypeAlias
 
 from typer.main import get_command
@@ -116,7 +114,3 @@ def _meaning(parameter: _Click) -> str:
     if parameter.envvar:
         text += f" Environment variable: `{parameter.envvar}`."
     return f"{text} Required." if parameter.required and parameter.param_type_name == "option" else text
-
-
-if __name__ == "__main__":
-    Path(sys.argv[1]).write_text(cli_reference(), encoding="utf-8")
