@@ -32,7 +32,7 @@ the messages that have one, and so on. Two strategies handle long loops of few m
 invalid message stays at its origin with no bytes left, where the following steps can read safely; its offsets are
 removed at the end. The row-wise decoder reports the error of such a message.
 
-`locate` chooses the method: templates (`walk.py`) for messages with equal length words, lockstep for many other
+`locate` chooses the method: templates for messages with equal length words, lockstep for many other
 messages, and `MessageWalker` for few.
 """
 

@@ -6,7 +6,7 @@ import json
 import os
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from datetime import datetime, timezone
 from difflib import get_close_matches
 from glob import has_magic
@@ -46,7 +46,7 @@ _Match = str | RemotePath
 
 
 class Recording(Struct, frozen=True):
-    """One recording: its parts, and its position (from 1) among those of the job."""
+    """One recording: its files, and its position (from 1) among the recordings of the job."""
 
     paths: tuple[AnyPath, ...]
     index: int
@@ -61,10 +61,10 @@ class Recording(Struct, frozen=True):
 
 
 def find_recordings(loaded: LoadedManifest) -> LazySequence[Recording]:
-    """Return what `bag.path` names: a list is one recording, a glob one for each match.
+    """Return the recordings of `bag.path`: a list is one recording, and every match of a glob is one.
 
     Raises:
-        NothingMatched: A file is not there, or a glob matches no recording.
+        NothingMatched: A file does not exist, or a glob matches no recording.
     """
     path = loaded.manifest.bag.path
     sources: Sequence[_Match | SplitGroup]
@@ -106,7 +106,7 @@ def _naming(loaded: LoadedManifest) -> Callable[[Recording], str]:
     """Return the function that fills in `sequence.name`; `_` replaces characters that names cannot have.
 
     Raises:
-        ManifestError: There is no such placeholder.
+        ManifestError: The name has an unknown placeholder.
     """
     template = loaded.manifest.sequence.name
     placeholders = list(placeholders_in(template))
@@ -153,7 +153,7 @@ def _fill(placeholder: Placeholder, recording: Recording) -> str:
 def _matches(
     loaded: LoadedManifest, pattern: str, key_path: tuple[str | int, ...]
 ) -> Sequence[str] | Sequence[RemotePath]:
-    """Return the file or directory `pattern` names, or the recordings it matches, sorted."""
+    """Return the file or directory with this path, or the recordings that match it as a glob, sorted."""
     path = with_network(loaded.resolve_or_url(pattern, *key_path), loaded.manifest.network.limits)
     if path.exists():
         return [path] if isinstance(path, RemotePath) else [str(path)]
@@ -214,18 +214,17 @@ def _is_hidden(path: str) -> bool:
 def _is_recording(path: AnyPath) -> bool:
     if path.is_file():
         return RECORDING_NAME.search(path.name) is not None
-    return path.is_dir() and ((path / "metadata.yaml").is_file() or _any_recording(_listed(path)))
+    return path.is_dir() and (
+        (path / "metadata.yaml").is_file()
+        or any(RECORDING_NAME.search(entry.name) for entry in _listed(path))
+    )
 
 
 def _listed(folder: AnyPath) -> list[AnyPath]:
     try:
         return list(folder.iterdir())
-    except OSError:  # what a pattern meets on its way need not be ours to read
+    except OSError:  # a glob may cover folders without permission to read
         return []
-
-
-def _any_recording(paths: Iterable[AnyPath]) -> bool:
-    return any(RECORDING_NAME.search(path.name) for path in paths)
 
 
 def _nearby(path: AnyPath) -> str:

@@ -1,4 +1,4 @@
-"""Planning: compare a job with its recording, and decide what happens to each topic."""
+"""Planning: the comparison of a job with its recording, and the decisions about each topic."""
 
 from __future__ import annotations
 

@@ -259,7 +259,7 @@ def decide_skip(
 
 
 def is_repeatable(provenance: Provenance, stored: StoredProvenance) -> bool:
-    """Return whether the stored sequence is what ended runs of the same job left incomplete of the same content."""
+    """Return whether the stored sequence is incomplete, and all of its sessions come from this job and this content."""
     return (
         not stored.complete
         and stored.finished
@@ -316,7 +316,7 @@ def _add_full_digests(
 
 
 def _remove_earlier_attempt(plan: Plan, run: str) -> IfExists:
-    """Delete what an earlier attempt of this run committed; return how to open the sequence afterwards.
+    """Delete the sessions that an earlier attempt of this run committed; return how to open the sequence afterwards.
 
     A server knows only the provenance of a sequence's first session, so sessions that were appended to another run's
     sequence are not recognized there.

@@ -22,7 +22,7 @@ _HOLDERS = 4
 
 
 class Attempt(Struct, frozen=True):
-    """An attempt to ingest a recording; a later attempt replaces what an earlier attempt of the same run committed."""
+    """An attempt to ingest a recording; a later attempt replaces the sessions of earlier attempts of the same run."""
 
     run: str
     """The id of the run."""
