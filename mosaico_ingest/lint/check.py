@@ -1,4 +1,4 @@
-"""What a lint check reads and yields: jobs, `.msg` files and event files in, problems out."""
+"""What a lint check reads and yields: jobs and `.msg` files in, problems out."""
 
 from __future__ import annotations
 
@@ -30,9 +30,8 @@ from mosaico_ingest.job.fields import (
 )
 from mosaico_ingest.job.manifest import check_manifest, combinations, fill_in
 from mosaico_ingest.job.model import JobSettings, Manifest
-from mosaico_ingest.job.split import Event, EventFile, overlaps, read_events
 from mosaico_ingest.job.validation import key_path_of
-from mosaico_ingest.job.values import Stores, TimeBound
+from mosaico_ingest.job.values import Stores
 from mosaico_ingest.job.yaml_source import KeyPath, Source, Value, load_source, member
 from mosaico_ingest.remote import without_options
 from mosaico_ingest.rosbag.definitions.model import normalize_msgtype
@@ -407,34 +406,3 @@ def _declaration(match: re.Match[str], file: str, number: int) -> Declaration:
     return Declaration(
         match["type"], match["name"], match["rest"].startswith("="), span("type"), span("name")
     )
-
-
-def event_problems(job: Job, rule: str) -> Iterator[Problem]:
-    """Yield the problems of one rule; a file that does not exist is a problem of `missing-file`."""
-    split = job.manifest.split
-    if split is None or not job.is_expanded(split.events):
-        return
-    path = job.resolve(str(split.events))
-    if path.is_file():
-        for finding in _findings(read_events(path)):
-            if finding.rule == rule and finding.span is not None:
-                yield Problem(finding.message, finding.span, finding.help)
-
-
-def _findings(file: EventFile) -> Iterator[Finding]:
-    """Yield the findings of a file; overlaps only between events whose times are relative to the same moment."""
-    yield from file.findings
-    by_reference: dict[str, list[tuple[int, int, Event]]] = {}
-    for event in file.events:
-        reference = _reference(event.start)
-        if reference == _reference(event.end):
-            by_reference.setdefault(reference, []).append((event.start.ns, event.end.ns, event))
-    for intervals in by_reference.values():
-        yield from overlaps(intervals)
-
-
-def _reference(bound: TimeBound) -> str:
-    """Return the moment that a bound is relative to."""
-    if not bound.relative:
-        return "epoch"
-    return "last message" if bound.ns < 0 else "first message"
