@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -48,3 +50,24 @@ def test_commands_do_not_import_pandas_or_yaml_but_leave_pandas_importable(
     assert run.returncode == 0, run.stderr
     uses_manifest = str(job) in arguments[command]
     assert run.stdout.split()[-3:] == [str(uses_manifest), "False", "1"]
+
+
+@pytest.mark.slow
+def test_worker_processes_do_not_import_pandas(tmp_path: Path) -> None:
+    mark = tmp_path / "imported"
+    fake = tmp_path / "modules" / "pandas.py"
+    fake.parent.mkdir()
+    fake.write_text(f"open({str(mark)!r}, 'w').close()\nraise ImportError\n")
+    for name in ("a", "b"):
+        shutil.copy(DRIVE, tmp_path / f"{name}.mcap")
+    job = tmp_path / "job.yaml"
+    job.write_text(
+        'version: 1\nbag: {path: "*.mcap", group: none}\nsequence: {name: "{stem}"}\ntarget: {store: store}\n'
+    )
+    paths = os.pathsep.join([str(fake.parent), os.environ.get("PYTHONPATH", "")])
+    subprocess.run(  # noqa: S603 - our own program
+        [sys.executable, "-m", "mosaico_ingest", str(job), "-q", "--jobs", "2"],
+        env={**os.environ, "PYTHONPATH": paths},
+        check=True,
+    )
+    assert not mark.exists()
