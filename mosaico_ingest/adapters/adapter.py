@@ -24,6 +24,17 @@ ROS_METADATA_KEY = "_ros_"
 MCAP_METADATA_KEY = "_mcap_"
 """Reserved key of topics in other encodings than those of ROS, with the same members as in the official SDK."""
 RESERVED_KEYS = frozenset({ROS_METADATA_KEY, MCAP_METADATA_KEY})
+_ENVELOPE_COLUMN = "timestamp_ns"
+_ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
+"""Type of a nested message without fields, named as in ROS 2: Parquet has no structs without fields."""
+_MEMBERS = {
+    ROS_METADATA_KEY: ("msgtype", "msgdef", "source_file"),
+    MCAP_METADATA_KEY: ("schema_name", "schema_def", "source_file", "channel_encoding"),
+}
+IMAGE_TAG = "Image"
+"""The tag of the ontology type whose rows can be stored as image files."""
+_FILES = frozenset({"png", "jpeg", "jpg", "tiff"})
+"""Formats whose `data` is an image file."""
 
 
 def source_metadata(definition: Definition, source_file: str, *, topic: str) -> dict[str, Any]:
@@ -52,12 +63,6 @@ class RecordedSchema(Struct, frozen=True):
     """As in `Definition.text`."""
     source_file: str
     language: Language = Language.ROS
-
-
-_MEMBERS = {
-    ROS_METADATA_KEY: ("msgtype", "msgdef", "source_file"),
-    MCAP_METADATA_KEY: ("schema_name", "schema_def", "source_file", "channel_encoding"),
-}
 
 
 def recorded_schema(metadata: Mapping[str, Any]) -> RecordedSchema | None:
@@ -206,11 +211,6 @@ def short_name(msgtype: str) -> str:
     return re.sub(r"\W", "_", re.split(r"[/.]", msgtype)[-1]) or "Message"
 
 
-_ENVELOPE_COLUMN = "timestamp_ns"
-_ONE_MEMBER = pa.struct([("structure_needs_at_least_one_member", pa.uint8())])
-"""Type of a nested message without fields, named as in ROS 2: Parquet has no structs without fields."""
-
-
 class UnmodeledSpec(Struct, frozen=True):
     """Keeps messages in their ROS shape; takes every type, and is not the default of any."""
 
@@ -277,12 +277,6 @@ def _with_members(rows: Any, struct: pa.StructType) -> pa.StructArray:  # noqa: 
     names = [field.name for field in struct]
     renamed = [dict(zip(names, row.values(), strict=True)) for row in rows.to_pylist()]
     return cast("pa.StructArray", pa.array(renamed, type=struct))
-
-
-IMAGE_TAG = "Image"
-"""The tag of the ontology type whose rows can be stored as image files."""
-_FILES = frozenset({"png", "jpeg", "jpg", "tiff"})
-"""Formats whose `data` is an image file."""
 
 
 class EncodedImageSpec(Struct, frozen=True):

@@ -42,16 +42,12 @@ from mosaico_ingest.ontology.registry import OntologyType, ontology_type, tags
 from mosaico_ingest.rosbag.definitions.linking import ros_shape
 from mosaico_ingest.rosbag.definitions.model import Container, Definition, Field, Language, normalize_msgtype
 
-
-def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
-    """Return the fields that no expression reads, such as `header.seq`; () for an adapter in Python.
-
-    A struct that is handed on whole counts as read.
-    """
-    if not isinstance(adapter, MappingAdapter):
-        return ()
-    reads = {*column_reads(adapter), *metadata_reads(adapter)}
-    return tuple(".".join(path) for path in unread_paths(shape, reads))
+_RESERVED = frozenset({"self", "nan", "inf", "pi", "true", "false", "null"})
+"""Names with another meaning in expressions."""
+_TELLING = 4
+"""Minimum length of a column name that is searched for within field names."""
+_LONG = 1500
+"""Maximum number of characters of a message in a test; longer messages are referenced in their recording."""
 
 
 class ColumnOrigin(Struct, frozen=True):
@@ -77,6 +73,17 @@ class Description(Struct, frozen=True):
     takes: Mapping[str, str]
     """Message type → path of the payload in it; empty if the payload is the message."""
     columns: tuple[ColumnOrigin, ...]
+
+
+def unread_fields(adapter: Adapter, shape: pa.StructType) -> tuple[str, ...]:
+    """Return the fields that no expression reads, such as `header.seq`; () for an adapter in Python.
+
+    A struct that is handed on whole counts as read.
+    """
+    if not isinstance(adapter, MappingAdapter):
+        return ()
+    reads = {*column_reads(adapter), *metadata_reads(adapter)}
+    return tuple(".".join(path) for path in unread_paths(shape, reads))
 
 
 def describe(spec: AdapterSpec, msgtype: str | None = None) -> Description:
@@ -206,12 +213,6 @@ def _number(value: float) -> str:
     if math.isinf(value):
         return ".inf" if value > 0 else "-.inf"
     return repr(value)
-
-
-_RESERVED = frozenset({"self", "nan", "inf", "pi", "true", "false", "null"})
-"""Names with another meaning in expressions."""
-_TELLING = 4
-"""Minimum length of a column name that is searched for within field names."""
 
 
 class ColumnDraft(Struct, frozen=True):
@@ -427,10 +428,6 @@ def _mirrored_field(
 def _element(type_: DataType) -> DataType:
     """Return the type of the elements of a list, any other type unchanged."""
     return type_.value_type if is_list(type_) else type_
-
-
-_LONG = 1500
-"""Maximum number of characters of a message in a test; longer messages are referenced in their recording."""
 
 
 class RecordedExample(Struct, frozen=True):

@@ -33,9 +33,10 @@ if TYPE_CHECKING:
 if TYPE_CHECKING:
     from mosaico_ingest.adapters.adapter import Envelope
     from mosaico_ingest.adapters.mapping.columns import DataType
-
 NO_PYTHON = "MOSAICO_NO_PYTHON"
 """The environment variable that refuses adapters in Python, unless it is empty or `0`."""
+_FIELDS = 40
+"""Maximum number of fields in a reason."""
 
 
 def is_python_allowed() -> bool:
@@ -61,7 +62,6 @@ def python_refusal(reference: str) -> tuple[str, str]:
 
 T = TypeVar("T", bound="Serializable")
 A = TypeVar("A", bound=type[Any])
-
 _registered: dict[str, type[Any]] = {}
 
 
@@ -154,8 +154,12 @@ class ROSAdapterBase(ABC, Generic[T]):
 
 @overload
 def register_default_adapter(adapter: A) -> A: ...
+
+
 @overload
 def register_default_adapter(adapter: None = None, *, is_default: bool = False) -> Callable[[A], A]: ...
+
+
 def register_default_adapter(
     adapter: A | None = None,
     *,
@@ -480,10 +484,6 @@ def _joined(parts: Sequence[pa.StructArray], struct: pa.StructType) -> pa.Struct
     if len(parts) == 1:
         return parts[0]
     return cast("pa.StructArray", pa.concat_arrays(parts) if parts else pa.array([], struct))
-
-
-_FIELDS = 40
-"""Maximum number of fields in a reason."""
 
 
 def rejection(

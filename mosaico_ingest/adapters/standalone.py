@@ -31,6 +31,28 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Embedded, Resolv
 from mosaico_ingest.rosbag.definitions.registry import CustomMessages, ROSTypeRegistry, TypeResolver, store_of
 from mosaico_ingest.rosbag.definitions.rosbags_types import definition_in, native_message
 
+ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray, Envelope]"]
+"""Reads one recorded message and returns its definition, a batch of one row in the ROS shape, and its envelope."""
+_RELATIVE, _ABSOLUTE = 1e-6, 1e-9
+"""Tolerances for numbers: float32 columns keep about seven digits."""
+_DISTROS = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS1_NOETIC)
+"""The distros to look up the type of a dict in; the first definition that has all keys of the dict is used."""
+
+
+class CaseResult(Struct, frozen=True):
+    """The result of one test of an adapter file."""
+
+    name: str
+    problems: tuple[str, ...]
+    """The differences, one line each; empty if the test passed."""
+    line: int
+    """The line of the test in the file."""
+
+    @property
+    def passed(self) -> bool:
+        """Whether the test found no difference."""
+        return not self.problems
+
 
 class DefinitionFinder:
     """Finds definitions by type name; implements `Resolver`."""
@@ -93,10 +115,6 @@ def mapping_of(spec: AdapterSpec) -> MappingSpec | None:
     if isinstance(spec, Builtin):
         return spec.mapping
     return spec if isinstance(spec, MappingSpec) else None
-
-
-_DISTROS = (Stores.LATEST, Stores.ROS2_HUMBLE, Stores.ROS2_FOXY, Stores.ROS1_NOETIC)
-"""The distros to look up the type of a dict in; the first definition that has all keys of the dict is used."""
 
 
 def translate(spec: AdapterSpec, msg: ROSMessage) -> Message:
@@ -256,28 +274,6 @@ def adapter_class(name: str) -> type[CatalogAdapter]:
         "ros_msgtype": builtin.ros_types,
     }
     return type(name, (CatalogAdapter,), members)
-
-
-ReadRecorded: TypeAlias = Callable[[RecordedMessage], "tuple[Definition, pa.StructArray, Envelope]"]
-"""Reads one recorded message and returns its definition, a batch of one row in the ROS shape, and its envelope."""
-
-_RELATIVE, _ABSOLUTE = 1e-6, 1e-9
-"""Tolerances for numbers: float32 columns keep about seven digits."""
-
-
-class CaseResult(Struct, frozen=True):
-    """The result of one test of an adapter file."""
-
-    name: str
-    problems: tuple[str, ...]
-    """The differences, one line each; empty if the test passed."""
-    line: int
-    """The line of the test in the file."""
-
-    @property
-    def passed(self) -> bool:
-        """Whether the test found no difference."""
-        return not self.problems
 
 
 def run_tests(

@@ -49,6 +49,18 @@ from mosaico_ingest.rosbag.definitions.model import Definition, Language
 from mosaico_ingest.rosbag.encodings import MessageReader
 from mosaico_ingest.rosbag.serialization import Deserializer
 
+_HEADER = 4
+_LARGEST = 2**31 - 1
+_FEW, _SMALL = 8, 4096
+"""Up to this many messages and bytes in total, row-wise decoding is faster."""
+_ORDERS = {">": 0, "<": 1}
+"""The second byte of the encapsulation header of plain CDR."""
+_ASCII_END = 0x80
+_UTF8_STEPS = (0x80, 0x800, 0x10000)
+"""Code points from which UTF-8 needs one more byte."""
+_SURROGATES = (0xD800, 0xE000)
+_UNICODE_END = 0x110000
+
 
 class Decoded(Struct, frozen=True):
     """The result of decoding a message block: rows, their positions in the block, and failures."""
@@ -131,13 +143,6 @@ def merge_parts(parts: list[Decoded]) -> Decoded:
     if bool((order[1:] < order[:-1]).any()):
         rows = rows.take(pa.Array.from_buffers(pa.int64(), len(order), [None, pa.py_buffer(order.data)]))
     return Decoded(rows, index[order], tuple(failures), padded, undeclared)
-
-
-_ASCII_END = 0x80
-_UTF8_STEPS = (0x80, 0x800, 0x10000)
-"""Code points from which UTF-8 needs one more byte."""
-_SURROGATES = (0xD800, 0xE000)
-_UNICODE_END = 0x110000
 
 
 def utf8_texts(kind: pa.DataType, sizes: Int64s, data: NDArray[np.uint8]) -> tuple[Array, Int64s]:
@@ -337,14 +342,6 @@ class RowwiseDecoder:
         padded = self._deserializer.padded
         decoded = self._decoder.decode(block)
         return replace(decoded, padded=self._deserializer.padded - padded)
-
-
-_HEADER = 4
-_LARGEST = 2**31 - 1
-_FEW, _SMALL = 8, 4096
-"""Up to this many messages and bytes in total, row-wise decoding is faster."""
-_ORDERS = {">": 0, "<": 1}
-"""The second byte of the encapsulation header of plain CDR."""
 
 
 class ColumnarDecoder:

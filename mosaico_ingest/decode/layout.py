@@ -29,7 +29,12 @@ _LARGE_BYTES = 4096
 """Average slice size above which individual copies are faster than `take`."""
 _FAR_BYTES = 1 << 28
 """Maximum distance of the first and last slice for `take`, which reserves half as many bytes."""
-
+WORD = 4
+"""Bytes of a length word."""
+PADDING, ZEROS = 3, 7
+"""Maximum number of arbitrary bytes, and of zero bytes, after the last value of a CDR message."""
+_MAX_ALIGN = 8
+_UNITS = {"string": 1, "wstring": 4}
 Array: TypeAlias = "pa.Array[Any]"
 
 
@@ -225,14 +230,6 @@ def array_of(
     """
     parts = [None, *(pa.py_buffer(buffer.data) for buffer in buffers)]
     return pa.Array.from_buffers(kind, length, parts, children=children)
-
-
-WORD = 4
-"""Bytes of a length word."""
-PADDING, ZEROS = 3, 7
-"""Maximum number of arbitrary bytes, and of zero bytes, after the last value of a CDR message."""
-_MAX_ALIGN = 8
-_UNITS = {"string": 1, "wstring": 4}
 
 
 class FixedBlock(Struct, frozen=True):

@@ -69,6 +69,18 @@ from mosaico_ingest.decode.layout import (
 )
 from mosaico_ingest.rosbag.blocks import Encoding
 
+FEW = 16
+"""Maximum number of messages for which walking one at a time is faster than lockstep."""
+_MANY_ELEMENTS = 64
+"""With at most `FEW` active messages, stay in lockstep only if more than this many elements remain in total."""
+_FIRST_ELEMENTS = 3
+"""Number of elements after which equal sizes must show; alignment may change the size of the first element."""
+_SPECULATION_SHARE = 4
+"""Speculate if at least one in this many active messages has two consecutive elements of equal size."""
+_AHEAD = 8
+"""Number of elements of the first speculation, and growth factor after a correct one."""
+_LARGE_BYTES = 64 << 10
+"""Minimum total size for lockstep with few messages, because they may contain long loops."""
 _MIN_GROUP = 4
 """Minimum number of messages per template."""
 _TEMPLATE_NS, _CHECK_NS = 120_000, 10
@@ -294,20 +306,6 @@ class _Template:
         distances = payloads.origins[rows] - self._payloads.origins
         tails = np.full(len(rows), self._tail or 0)
         return LocatedMessages(rows, tails, tuple(step.repeat_at(distances) for step in self._offsets))
-
-
-FEW = 16
-"""Maximum number of messages for which walking one at a time is faster than lockstep."""
-_MANY_ELEMENTS = 64
-"""With at most `FEW` active messages, stay in lockstep only if more than this many elements remain in total."""
-_FIRST_ELEMENTS = 3
-"""Number of elements after which equal sizes must show; alignment may change the size of the first element."""
-_SPECULATION_SHARE = 4
-"""Speculate if at least one in this many active messages has two consecutive elements of equal size."""
-_AHEAD = 8
-"""Number of elements of the first speculation, and growth factor after a correct one."""
-_LARGE_BYTES = 64 << 10
-"""Minimum total size for lockstep with few messages, because they may contain long loops."""
 
 
 def locate(layout: Layout, payloads: Payloads) -> LocatedMessages:

@@ -29,7 +29,6 @@ from mosaico_ingest.lazy import cache_by_identity
 
 if TYPE_CHECKING:
     from mosaico_ingest.ontology.model import Serializable
-
 PLAIN_TYPES: Mapping[pa.DataType, pa.DataType] = {
     pa.large_string(): pa.string(),
     pa.string_view(): pa.string(),
@@ -37,6 +36,41 @@ PLAIN_TYPES: Mapping[pa.DataType, pa.DataType] = {
     pa.binary_view(): pa.binary(),
 }
 """The plain type of texts and bytes by their large and view types."""
+_arrays: Any = pa
+"""pyarrow, whose stubs do not accept `type` together with `mask`."""
+_arrow: Any = pa
+"""pyarrow, whose stubs do not accept a `str` as the name of a type."""
+_KEPT_BYTES = 1 << 20
+_Fill: TypeAlias = Callable[[Any], Any]
+"""Fills an array, or returns it unchanged if there is nothing to fill."""
+EncodedType: TypeAlias = "str | list[Any] | dict[str, Any]"
+"""An Arrow type in `columns.json`."""
+COLUMNS_FILE = Path(__file__).with_name("columns.json")
+MODULES: Mapping[str, str] = MappingProxyType(
+    {
+        tag: module
+        for module, names in {
+            "geometry": (
+                "Acceleration ForceTorque FrameTransform Inertia MotionState Point2d Point3d Polygon Pose Quaternion "
+                "RobotPath Transform Vector2d Vector3d Vector4d Velocity"
+            ),
+            "model": "Duration Header Time",
+            "perception": (
+                "CameraInfo CompressedImage GridCells Image LaserScan Lidar MapMetadata MultiEchoLaserScan OccupancyGrid "
+                "PointCloud2 PointField RGBDCamera ROI Radar Range StereoCamera ToFCamera"
+            ),
+            "scalars": (
+                "Boolean Floating16 Floating32 Floating64 Integer16 Integer32 Integer64 Integer8 "
+                "String Unmodeled Unsigned16 Unsigned32 Unsigned64 Unsigned8"
+            ),
+            "sensors": "BatteryState GPS GPSStatus IMU Joy Magnetometer NMEASentence Pressure RobotJoint Temperature",
+        }.items()
+        for tag in names.split()
+    }
+)
+"""The module of each built-in tag; tags are class names."""
+DEFINED: dict[str, type[Serializable]] = {}
+"""Model classes by tag; a later class with the same tag replaces an earlier one."""
 
 
 class SerializationFormat(str, Enum):
@@ -60,6 +94,10 @@ class OntologyType(Struct, frozen=True):
         return fingerprint(self.struct)
 
 
+class UnknownTag(AdapterError, KeyError):  # noqa: N818 - the condition, as `NothingMatched`
+    """No model has the tag."""
+
+
 @cache_by_identity
 def fingerprint(struct: pa.StructType) -> str:
     """Return the first ten hex digits of the SHA-1 of the struct's text; top-level large and view types count as plain."""
@@ -67,13 +105,6 @@ def fingerprint(struct: pa.StructType) -> str:
         pa.field(field.name, PLAIN_TYPES.get(field.type) or field.type, field.nullable) for field in struct
     ]
     return hashlib.sha1(str(pa.struct(fields)).encode(), usedforsecurity=False).hexdigest()[:10]
-
-
-_arrays: Any = pa
-"""pyarrow, whose stubs do not accept `type` together with `mask`."""
-_KEPT_BYTES = 1 << 20
-_Fill: TypeAlias = Callable[[Any], Any]
-"""Fills an array, or returns it unchanged if there is nothing to fill."""
 
 
 class RequiredFields:
@@ -192,41 +223,6 @@ def _zero(kind: pa.DataType) -> pa.Scalar[Any]:
     return pa.scalar(False if pt.is_boolean(kind) else 0, kind)
 
 
-DEFINED: dict[str, type[Serializable]] = {}
-"""Model classes by tag; a later class with the same tag replaces an earlier one."""
-
-MODULES: Mapping[str, str] = MappingProxyType(
-    {
-        tag: module
-        for module, names in {
-            "geometry": (
-                "Acceleration ForceTorque FrameTransform Inertia MotionState Point2d Point3d Polygon Pose Quaternion "
-                "RobotPath Transform Vector2d Vector3d Vector4d Velocity"
-            ),
-            "model": "Duration Header Time",
-            "perception": (
-                "CameraInfo CompressedImage GridCells Image LaserScan Lidar MapMetadata MultiEchoLaserScan OccupancyGrid "
-                "PointCloud2 PointField RGBDCamera ROI Radar Range StereoCamera ToFCamera"
-            ),
-            "scalars": (
-                "Boolean Floating16 Floating32 Floating64 Integer16 Integer32 Integer64 Integer8 "
-                "String Unmodeled Unsigned16 Unsigned32 Unsigned64 Unsigned8"
-            ),
-            "sensors": "BatteryState GPS GPSStatus IMU Joy Magnetometer NMEASentence Pressure RobotJoint Temperature",
-        }.items()
-        for tag in names.split()
-    }
-)
-"""The module of each built-in tag; tags are class names."""
-
-COLUMNS_FILE = Path(__file__).with_name("columns.json")
-
-EncodedType: TypeAlias = "str | list[Any] | dict[str, Any]"
-"""An Arrow type in `columns.json`."""
-_arrow: Any = pa
-"""pyarrow, whose stubs do not accept a `str` as the name of a type."""
-
-
 @cache
 def builtin_type(tag: str) -> OntologyType:
     """Return the ontology type of a built-in tag; raises KeyError for any other tag."""
@@ -265,10 +261,6 @@ def _encode_type(kind: Any) -> EncodedType:  # noqa: ANN401 - the stubs hide the
     if pa.types.is_fixed_size_list(kind):
         return [_encode_type(kind.value_type), kind.list_size]
     return [_encode_type(kind.value_type)] if pa.types.is_list(kind) else str(kind)
-
-
-class UnknownTag(AdapterError, KeyError):  # noqa: N818 - the condition, as `NothingMatched`
-    """No model has the tag."""
 
 
 def model(tag: str) -> type[Serializable]:
@@ -386,7 +378,6 @@ UNITS: Mapping[str, Mapping[str, str]] = MappingProxyType(
     }
 )
 """Units by ontology tag and column; the unit of a struct applies to its components."""
-
 _WITHOUT_UNIT = frozenset({"header", "covariance", "covariance_type", "variance", "variance_type"})
 """Members of a struct that do not have the unit of its components."""
 

@@ -20,9 +20,13 @@ pc: Any = pyarrow.compute
 pt: Any = pyarrow.types
 arrays: Any = pa
 """pyarrow without its stubs, which are narrower than the constructors."""
-
 Mask = NDArray[np.bool_]
 SECOND_NS = 1_000_000_000
+Bounds = tuple[int, int]
+INT64 = (-(2**63), 2**63 - 1)
+_FLOATS = (pa.float16(), pa.float32(), pa.float64())
+_EXACT_INTEGERS = (2**11, 2**24, 2**53)
+"""Magnitude up to which each of the floats represents every integer exactly."""
 
 
 class Axis(Struct, frozen=True, eq=False):
@@ -199,13 +203,6 @@ def _in_type(values: Array, type_: DataType) -> Array:
         scalar = isinstance(values, pa.Scalar)
         return arrays.scalar(None, type_) if scalar else arrays.nulls(len(values), type_)
     return pc.cast(values, type_, safe=False)
-
-
-Bounds = tuple[int, int]
-INT64 = (-(2**63), 2**63 - 1)
-_FLOATS = (pa.float16(), pa.float32(), pa.float64())
-_EXACT_INTEGERS = (2**11, 2**24, 2**53)
-"""Magnitude up to which each of the floats represents every integer exactly."""
 
 
 class TypeMismatch(Exception):  # noqa: N818 - a condition of two types, turned into a finding by the checker

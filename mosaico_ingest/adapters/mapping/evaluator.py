@@ -63,6 +63,65 @@ class RowsRejected(Exception):  # noqa: N818 - control flow: the caller retries 
         self.rejections = rejections
 
 
+class NullColumn(Struct, frozen=True):
+    """Null in every row."""
+
+    rows: NullRows
+
+
+class ExpressionSource(Struct, frozen=True):
+    """The values of an expression."""
+
+    expression: TypedExpression
+
+
+class MapLookup(Struct, frozen=True):
+    """The values of an expression, replaced according to a table (`map`)."""
+
+    operand: TypedExpression
+    keys: Any
+    """An Arrow array of the values to replace."""
+    values: Any
+    """An Arrow array of the replacements."""
+    otherwise: TypedExpression | None
+    """Replaces values that are not in the table; None rejects their rows."""
+
+
+class NestedAdapter(Struct, frozen=True):
+    """The records that another adapter makes of nested messages (`use`)."""
+
+    operand: TypedExpression
+    adapter: Adapter
+    name: str
+    msgtype: str
+
+
+class StructSource(Struct, frozen=True):
+    """A struct with one plan per field (`fields`)."""
+
+    operand: TypedExpression | None
+    """The nested message in which names are looked up (`of`)."""
+    fields: tuple[ColumnPlan, ...]
+
+
+ColumnSource: TypeAlias = "NullColumn | ExpressionSource | MapLookup | NestedAdapter | StructSource"
+
+
+class ColumnPlan(Struct, frozen=True):
+    """One column of the record, or a field of a struct column, and the source of its values."""
+
+    path: str
+    """The column's path, such as `pose.position`."""
+    name: str
+    type: DataType
+    nullable: bool
+    source: ColumnSource
+    overrides: tuple[ColumnPlan, ...] = ()
+    """Fields of the struct that have another source (`with`)."""
+    when: TypedExpression | None = None
+    """The column is null in rows where this condition is not true."""
+
+
 class Evaluation:
     """The values of expressions over one batch; equal expressions are computed once."""
 
@@ -329,6 +388,34 @@ class Evaluation:
         return Column(pc.if_else(mask, *branches), axes)
 
 
+def evaluate_column(evaluation: Evaluation, plan: ColumnPlan) -> Array:
+    """Return one column in its exact type, one value per row.
+
+    Raises:
+        RowsRejected: Some rows do not fit.
+    """
+    if plan.when is None:
+        values = _evaluate(evaluation, plan)
+    else:
+        condition = evaluation.mask(plan.when)
+        with evaluation.within(Column(arrays.array(condition))):
+            values = _evaluate(evaluation, plan)
+        values = null_where(values, ~condition)
+    if plan.nullable:
+        return values
+    evaluation.target = plan.path
+    return refuse_nulls(values, None, evaluation.rejecter((), plan.path))
+
+
+def evaluate_struct(evaluation: Evaluation, plans: tuple[ColumnPlan, ...], type_: DataType) -> Array:
+    """Return a struct column with one field per plan, one value per row.
+
+    Raises:
+        RowsRejected: Some rows do not fit.
+    """
+    return struct_of([evaluate_column(evaluation, plan) for plan in plans], type_, None, len(evaluation))
+
+
 def reject_by_rule(rejections: Mapping[int, Rejection], count: int, refuse: RejectRows) -> None:
     """Reject elements, with one call per rule."""
     for rule in dict.fromkeys(rule for rule, _ in rejections.values()):
@@ -364,93 +451,6 @@ def _element_at(lists: Array, index: int) -> Array:
     if not absent.any():
         return elements.take(arrays.array(positions))
     return elements.take(arrays.array(np.where(absent, 0, positions), mask=absent))
-
-
-class NullColumn(Struct, frozen=True):
-    """Null in every row."""
-
-    rows: NullRows
-
-
-class ExpressionSource(Struct, frozen=True):
-    """The values of an expression."""
-
-    expression: TypedExpression
-
-
-class MapLookup(Struct, frozen=True):
-    """The values of an expression, replaced according to a table (`map`)."""
-
-    operand: TypedExpression
-    keys: Any
-    """An Arrow array of the values to replace."""
-    values: Any
-    """An Arrow array of the replacements."""
-    otherwise: TypedExpression | None
-    """Replaces values that are not in the table; None rejects their rows."""
-
-
-class NestedAdapter(Struct, frozen=True):
-    """The records that another adapter makes of nested messages (`use`)."""
-
-    operand: TypedExpression
-    adapter: Adapter
-    name: str
-    msgtype: str
-
-
-class StructSource(Struct, frozen=True):
-    """A struct with one plan per field (`fields`)."""
-
-    operand: TypedExpression | None
-    """The nested message in which names are looked up (`of`)."""
-    fields: tuple[ColumnPlan, ...]
-
-
-ColumnSource: TypeAlias = "NullColumn | ExpressionSource | MapLookup | NestedAdapter | StructSource"
-
-
-class ColumnPlan(Struct, frozen=True):
-    """One column of the record, or a field of a struct column, and the source of its values."""
-
-    path: str
-    """The column's path, such as `pose.position`."""
-    name: str
-    type: DataType
-    nullable: bool
-    source: ColumnSource
-    overrides: tuple[ColumnPlan, ...] = ()
-    """Fields of the struct that have another source (`with`)."""
-    when: TypedExpression | None = None
-    """The column is null in rows where this condition is not true."""
-
-
-def evaluate_column(evaluation: Evaluation, plan: ColumnPlan) -> Array:
-    """Return one column in its exact type, one value per row.
-
-    Raises:
-        RowsRejected: Some rows do not fit.
-    """
-    if plan.when is None:
-        values = _evaluate(evaluation, plan)
-    else:
-        condition = evaluation.mask(plan.when)
-        with evaluation.within(Column(arrays.array(condition))):
-            values = _evaluate(evaluation, plan)
-        values = null_where(values, ~condition)
-    if plan.nullable:
-        return values
-    evaluation.target = plan.path
-    return refuse_nulls(values, None, evaluation.rejecter((), plan.path))
-
-
-def evaluate_struct(evaluation: Evaluation, plans: tuple[ColumnPlan, ...], type_: DataType) -> Array:
-    """Return a struct column with one field per plan, one value per row.
-
-    Raises:
-        RowsRejected: Some rows do not fit.
-    """
-    return struct_of([evaluate_column(evaluation, plan) for plan in plans], type_, None, len(evaluation))
 
 
 def _evaluate(evaluation: Evaluation, plan: ColumnPlan) -> Array:

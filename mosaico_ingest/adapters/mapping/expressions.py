@@ -20,15 +20,54 @@ from mosaico_ingest.adapters.mapping.functions.registry import Function
 
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
-
 MAX_CHARACTERS = 4000
 MAX_DEPTH = 60
-
 LiteralValue: TypeAlias = "bool | int | float | str | None"
 TextRange: TypeAlias = tuple[int, int]
 """Start and end (exclusive) within the expression's text, in characters."""
-
-
+_WORDS: dict[str, LiteralValue] = {"null": None, "true": True, "false": False}
+_OPERATORS: dict[type[ast.AST], str] = {
+    ast.Add: "+",
+    ast.Sub: "-",
+    ast.Mult: "*",
+    ast.Div: "/",
+    ast.FloorDiv: "//",
+    ast.Mod: "%",
+    ast.Pow: "**",
+    ast.Eq: "==",
+    ast.NotEq: "!=",
+    ast.Lt: "<",
+    ast.LtE: "<=",
+    ast.Gt: ">",
+    ast.GtE: ">=",
+    ast.And: "and",
+    ast.Or: "or",
+    ast.Not: "not",
+    ast.USub: "negative",
+    ast.UAdd: "positive",
+    ast.BitAnd: "&",
+    ast.BitOr: "|",
+    ast.BitXor: "^",
+    ast.Invert: "~",
+    ast.LShift: "<<",
+    ast.RShift: ">>",
+}
+_PYTHON_ONLY: dict[type[ast.AST], str] = {
+    ast.Is: "is_null(x) for null, `==` for other values",
+    ast.IsNot: "not is_null(x) for null, `!=` for other values",
+}
+_REPLACEMENTS = {
+    "&&": "write `and`",
+    "||": "write `or`",
+    "!": "write `not`",
+    "===": "write `==`",
+    "!==": "write `!=`",
+    "=": "write `==` to compare",
+    "?": "write `a if condition else b`",
+}
+"""Operators of C and JavaScript, which Python's parser rejects, and what to write instead."""
+_FOREIGN_OPERATOR = re.compile(r"&&|\|\||[!=]==|\?|!(?!=)|(?<![=!<>*/%+-])=(?!=)")
+_QUOTED = re.compile(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"")
 _NOT_COMPARED = frozenset({"span", "name_span", "type", "text", "function"})
 """Fields that locate a node or follow from its other fields."""
 
@@ -129,51 +168,127 @@ class Ternary(ExpressionNode, frozen=True, eq=False):
 
 Node: TypeAlias = "Literal | Name | Attribute | EachElement | Subscript | ListLiteral | Call | Ternary"
 
-_WORDS: dict[str, LiteralValue] = {"null": None, "true": True, "false": False}
-_OPERATORS: dict[type[ast.AST], str] = {
-    ast.Add: "+",
-    ast.Sub: "-",
-    ast.Mult: "*",
-    ast.Div: "/",
-    ast.FloorDiv: "//",
-    ast.Mod: "%",
-    ast.Pow: "**",
-    ast.Eq: "==",
-    ast.NotEq: "!=",
-    ast.Lt: "<",
-    ast.LtE: "<=",
-    ast.Gt: ">",
-    ast.GtE: ">=",
-    ast.And: "and",
-    ast.Or: "or",
-    ast.Not: "not",
-    ast.USub: "negative",
-    ast.UAdd: "positive",
-    ast.BitAnd: "&",
-    ast.BitOr: "|",
-    ast.BitXor: "^",
-    ast.Invert: "~",
-    ast.LShift: "<<",
-    ast.RShift: ">>",
-}
+
+class Constant(ExpressionNode, frozen=True, eq=False):
+    """A value that is the same for every row."""
+
+    value: LiteralValue
+    type: ExprType
+    text: str = ""
+
+    def _content(self) -> tuple[object, ...]:
+        return (repr(self.value), self.type.arrow)  # because True == 1 == 1.0, and 0.0 == -0.0
 
 
-_PYTHON_ONLY: dict[type[ast.AST], str] = {
-    ast.Is: "is_null(x) for null, `==` for other values",
-    ast.IsNot: "not is_null(x) for null, `!=` for other values",
-}
-_REPLACEMENTS = {
-    "&&": "write `and`",
-    "||": "write `or`",
-    "!": "write `not`",
-    "===": "write `==`",
-    "!==": "write `!=`",
-    "=": "write `==` to compare",
-    "?": "write `a if condition else b`",
-}
-"""Operators of C and JavaScript, which Python's parser rejects, and what to write instead."""
-_FOREIGN_OPERATOR = re.compile(r"&&|\|\||[!=]==|\?|!(?!=)|(?<![=!<>*/%+-])=(?!=)")
-_QUOTED = re.compile(r"'(?:\\.|[^'\\])*'|\"(?:\\.|[^\"\\])*\"")
+class MessageRef(ExpressionNode, frozen=True, eq=False):
+    """The message in which names are looked up."""
+
+    type: ExprType
+    text: str = "self"
+
+
+class EnvelopeField(ExpressionNode, frozen=True, eq=False):
+    """A property of the message besides its content, such as `message.log_time`."""
+
+    name: str
+    type: ExprType
+    text: str = ""
+
+
+class OuterValue(ExpressionNode, frozen=True, eq=False):
+    """A value of an enclosing scope, repeated for the nested messages of each of its rows."""
+
+    operand: TypedExpression
+    levels: int
+    """The number of scopes between the expression and the operand."""
+    type: ExprType
+    text: str = ""
+
+
+class FieldAccess(ExpressionNode, frozen=True, eq=False):
+    """A field of a message."""
+
+    operand: TypedExpression
+    name: str
+    type: ExprType
+    text: str = ""
+
+
+class OpenList(ExpressionNode, frozen=True, eq=False):
+    """The elements of a list (`operand[]`): operations on them apply to each element."""
+
+    operand: TypedExpression
+    type: ExprType
+    text: str = ""
+
+
+class CloseList(ExpressionNode, frozen=True, eq=False):
+    """A list rebuilt from its elements, because a function takes the list instead of one element."""
+
+    operand: TypedExpression
+    type: ExprType
+    text: str = ""
+
+
+class ElementAt(ExpressionNode, frozen=True, eq=False):
+    """One element of a list, null if the list is too short."""
+
+    operand: TypedExpression
+    index: int
+    type: ExprType
+    text: str = ""
+
+
+class MakeList(ExpressionNode, frozen=True, eq=False):
+    """A fixed-size list of values."""
+
+    items: tuple[TypedExpression, ...]
+    type: ExprType
+    text: str = ""
+
+
+class Cast(ExpressionNode, frozen=True, eq=False):
+    """A number in another type, checked for every row."""
+
+    operand: TypedExpression
+    target: DataType
+    type: ExprType
+    text: str = ""
+
+
+class FunctionCall(ExpressionNode, frozen=True, eq=False):
+    """A function or operator applied to its arguments."""
+
+    name: str
+    function: Function
+    arguments: tuple[TypedExpression, ...]
+    type: ExprType
+    text: str = ""
+    names: tuple[str, ...] = ()
+    """The names of the arguments, for a function whose result depends on them."""
+
+
+class Conditional(ExpressionNode, frozen=True, eq=False):
+    """One of two values, chosen for each row."""
+
+    condition: TypedExpression
+    then: TypedExpression
+    otherwise: TypedExpression
+    type: ExprType
+    text: str = ""
+
+
+class AnalyzedExpression(Struct, frozen=True):
+    """An expression of the file; `typed` is None while no message definition is known."""
+
+    path: KeyPath
+    """The key path of the expression in the file."""
+    text: str
+    node: Node
+    typed: TypedExpression | None
+
+
+TypedExpression: TypeAlias = "Constant | MessageRef | EnvelopeField | OuterValue | FieldAccess | OpenList | CloseList | ElementAt | MakeList | Cast | FunctionCall | Conditional"
 
 
 def parse(text: str) -> Node:
@@ -440,125 +555,3 @@ class _Parser:
         if name == "if_else" and len(arguments) == 3:  # noqa: PLR2004 - condition, then, otherwise
             return Ternary(*arguments, span=span)
         return Call(name, arguments, span, name_span)
-
-
-class Constant(ExpressionNode, frozen=True, eq=False):
-    """A value that is the same for every row."""
-
-    value: LiteralValue
-    type: ExprType
-    text: str = ""
-
-    def _content(self) -> tuple[object, ...]:
-        return (repr(self.value), self.type.arrow)  # because True == 1 == 1.0, and 0.0 == -0.0
-
-
-class MessageRef(ExpressionNode, frozen=True, eq=False):
-    """The message in which names are looked up."""
-
-    type: ExprType
-    text: str = "self"
-
-
-class EnvelopeField(ExpressionNode, frozen=True, eq=False):
-    """A property of the message besides its content, such as `message.log_time`."""
-
-    name: str
-    type: ExprType
-    text: str = ""
-
-
-class OuterValue(ExpressionNode, frozen=True, eq=False):
-    """A value of an enclosing scope, repeated for the nested messages of each of its rows."""
-
-    operand: TypedExpression
-    levels: int
-    """The number of scopes between the expression and the operand."""
-    type: ExprType
-    text: str = ""
-
-
-class FieldAccess(ExpressionNode, frozen=True, eq=False):
-    """A field of a message."""
-
-    operand: TypedExpression
-    name: str
-    type: ExprType
-    text: str = ""
-
-
-class OpenList(ExpressionNode, frozen=True, eq=False):
-    """The elements of a list (`operand[]`): operations on them apply to each element."""
-
-    operand: TypedExpression
-    type: ExprType
-    text: str = ""
-
-
-class CloseList(ExpressionNode, frozen=True, eq=False):
-    """A list rebuilt from its elements, because a function takes the list instead of one element."""
-
-    operand: TypedExpression
-    type: ExprType
-    text: str = ""
-
-
-class ElementAt(ExpressionNode, frozen=True, eq=False):
-    """One element of a list, null if the list is too short."""
-
-    operand: TypedExpression
-    index: int
-    type: ExprType
-    text: str = ""
-
-
-class MakeList(ExpressionNode, frozen=True, eq=False):
-    """A fixed-size list of values."""
-
-    items: tuple[TypedExpression, ...]
-    type: ExprType
-    text: str = ""
-
-
-class Cast(ExpressionNode, frozen=True, eq=False):
-    """A number in another type, checked for every row."""
-
-    operand: TypedExpression
-    target: DataType
-    type: ExprType
-    text: str = ""
-
-
-class FunctionCall(ExpressionNode, frozen=True, eq=False):
-    """A function or operator applied to its arguments."""
-
-    name: str
-    function: Function
-    arguments: tuple[TypedExpression, ...]
-    type: ExprType
-    text: str = ""
-    names: tuple[str, ...] = ()
-    """The names of the arguments, for a function whose result depends on them."""
-
-
-class Conditional(ExpressionNode, frozen=True, eq=False):
-    """One of two values, chosen for each row."""
-
-    condition: TypedExpression
-    then: TypedExpression
-    otherwise: TypedExpression
-    type: ExprType
-    text: str = ""
-
-
-class AnalyzedExpression(Struct, frozen=True):
-    """An expression of the file; `typed` is None while no message definition is known."""
-
-    path: KeyPath
-    """The key path of the expression in the file."""
-    text: str
-    node: Node
-    typed: TypedExpression | None
-
-
-TypedExpression: TypeAlias = "Constant | MessageRef | EnvelopeField | OuterValue | FieldAccess | OpenList | CloseList | ElementAt | MakeList | Cast | FunctionCall | Conditional"

@@ -74,12 +74,19 @@ if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import Source
 if TYPE_CHECKING:
     from mosaico_ingest.job.yaml_source import KeyPath
-
 _BINDING: ContextVar[tuple[tuple[str, str], ...]] = ContextVar("binding", default=())
 """The adapters being bound with their message types, to detect adapters that use each other in a cycle."""
 _MAX_CACHED_BINDINGS = 64
 _BindingKey: TypeAlias = tuple[str, int, tuple[MessageType, ...], pa.StructType]
 """What the compiled mapping depends on: root type, ROS version, message types, type of the rows."""
+PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
+_LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
+_ENVELOPE_COLUMN = "timestamp_ns"
+_LIST_OF_STRUCTS = "list"
+ReadPath: TypeAlias = "tuple[str, ...]"
+"""The names that lead to a field, without marks for lists: `joints`, `name` for `joints[].name`."""
+_Scopes: TypeAlias = "tuple[ReadPath, ...]"
+"""The paths of the messages around an expression, outermost first; names are looked up in the last one."""
 
 
 class _OutputRows(Struct, frozen=True):
@@ -512,12 +519,6 @@ def _adapter_error(message: str, source: Source, findings: tuple[Finding, ...]) 
     return AdapterError(text, where=location, hint=first.help if first else None, findings=findings)
 
 
-PLAIN_TYPES: dict[str, DataType] = {**CAST_TYPES, "string": arrays.string(), "binary": arrays.binary()}
-_LIST = re.compile(r"list\[\s*(?P<element>.+?)\s*(,\s*(?P<size>\d+)\s*)?\]")
-_ENVELOPE_COLUMN = "timestamp_ns"
-_LIST_OF_STRUCTS = "list"
-
-
 def inline_ontology_type(inline: InlineType, analyzer: Analyzer, base: KeyPath = ()) -> OntologyType:
     """Return the ontology type declared below the key path `base`; fields with a finding are omitted."""
     path: KeyPath = (*base, "ontology", "fields")
@@ -573,12 +574,6 @@ def _type(text: str, path: KeyPath, analyzer: Analyzer) -> DataType | None:
         hint = f"{nearest} {types}" if nearest and nearest.startswith("did you mean") else types
         analyzer.report_value(path, f"{text!r} is neither a type nor an ontology tag", hint)
         return None
-
-
-ReadPath: TypeAlias = "tuple[str, ...]"
-"""The names that lead to a field, without marks for lists: `joints`, `name` for `joints[].name`."""
-_Scopes: TypeAlias = "tuple[ReadPath, ...]"
-"""The paths of the messages around an expression, outermost first; names are looked up in the last one."""
 
 
 def unread_paths(shape: DataType, reads: set[ReadPath], at: ReadPath = ()) -> Iterator[ReadPath]:

@@ -202,9 +202,6 @@ def all_(x: Array) -> Array:
     return _logic(x, np.logical_and, empty=True)
 
 
-__all__: list[str] = []
-
-
 def _is_ordered(type_: Any) -> bool:  # noqa: ANN401 - an Arrow type
     return is_number(type_) or pt.is_string(type_) or pt.is_boolean(type_)
 

@@ -313,8 +313,6 @@ def _codec(text: str) -> str:
     return "png" if not words or words[-1] == "compresseddepth" else "raw"
 
 
-__all__: list[str] = []
-
 _NUMBERS = ("height", "width", "is_bigendian", "point_step", "row_step")
 _FIELDS: dict[str, Any] = {
     **dict.fromkeys(_NUMBERS, pt.is_primitive),
@@ -324,7 +322,6 @@ _FIELDS: dict[str, Any] = {
 _CLOUD = struct_with("a sensor_msgs/PointCloud2", _FIELDS)
 _DATATYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 _PACKED_BYTES = 4
-
 Numbers: TypeAlias = "NDArray[Any]"
 Convert: TypeAlias = "Callable[[Numbers], Numbers]"
 

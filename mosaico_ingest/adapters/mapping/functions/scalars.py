@@ -50,8 +50,6 @@ from mosaico_ingest.adapters.mapping.functions.registry import (
     set_null,
 )
 
-__all__: list[str] = []
-
 
 def _joined(*expr_types: ExprType) -> ExprType:
     return common_type(list(expr_types))
@@ -232,9 +230,6 @@ def clip(refuse: RejectRows, x: Array, low: Array, high: Array) -> Array:
 def bit(refuse: RejectRows, x: Array, n: Array) -> Array:
     """Whether bit n of an integer is set; the lowest is bit 0; rejects rows with n outside of 0 … 63."""
     return pc.equal(pc.bit_wise_and(shifted(refuse, ">>", x, n), 1), 1)
-
-
-__all__: list[str] = []
 
 
 def _is_text_or_number(expr_type: ExprType) -> bool:
