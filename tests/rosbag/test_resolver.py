@@ -64,6 +64,22 @@ class TestOrder:
             "builtin_interfaces/msg/Time",
         }  # fmt: skip
 
+    @pytest.mark.parametrize("version", [1, 2])
+    def test_resolve_complete_text_shares_definition_between_resolvers(self, version: int) -> None:
+        text = f"Header header\nPart[] parts\n{BAR}\nMSG: mine/Part\nfloat32 size\n{BAR}\nMSG: std_msgs/Header\nstring frame_id"
+        shared = resolve(TypeResolver(), "mine/msg/Whole", text, version)
+        assert resolve(TypeResolver(), "mine/msg/Whole", text, version) is shared
+        other = TypeResolver(
+            types={"other/msg/Unused": "int8 x"}
+        )  # with own types, nested types are searched individually
+        assert resolve(other, "mine/msg/Whole", text, version) == shared
+
+    def test_resolve_incomplete_text_uses_custom_type_of_own_resolver(self) -> None:
+        sizes = ("float32 size", "float64 size")
+        resolvers = [TypeResolver(types={"mine/msg/Part": size}) for size in sizes]
+        definitions = [resolve(resolver, "mine/msg/Whole", "mine/Part part") for resolver in resolvers]
+        assert [each.types["mine/msg/Part"].fields[0].type for each in definitions] == ["float32", "float64"]
+
     def test_resolve_keeps_definitions_of_connections_apart(self) -> None:
         resolver = TypeResolver()
         first, second = resolve(resolver, "a/msg/B", "int8 x"), resolve(resolver, "a/msg/B", "int16 x")
