@@ -1,6 +1,7 @@
 """Measure the cost of data contracts: in a run, and as checks without a run, compared with other tools.
 
     python benchmarks/contracts.py [--runs 5] [--data FOLDER] [--tracecheck PROGRAM] [--pymcap-cli PROGRAM] [--only NAME]
+        [--instructions]
 
 Shares of a run refer to CPU time, which other load affects less than wall time; runs with and without a contract alternate.
 The checks of all tools are complete processes with equivalent contracts that hold.
@@ -11,6 +12,7 @@ from __future__ import annotations
 import argparse
 import json
 import shutil
+import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -126,18 +128,34 @@ def alternate(commands: dict[str, list[str | Path]], runs: int, store: Path) -> 
     return {name: typical(of_command) for name, of_command in samples.items()}
 
 
-def print_runs(name: str, contracts: Contracts, runs: int) -> None:
-    """Print the CPU time of a run, and what the contracts add to it."""
+def instructions(command: list[str | Path], store: Path) -> int:
+    """Return the number of instructions of a command in user mode, in millions; the median of three runs."""
+    counts: list[int] = []
+    for _ in range(3):
+        shutil.rmtree(store, ignore_errors=True)
+        counting = ["perf", "stat", "-x,", "-e", "instructions:u", *command]
+        text = subprocess.run(counting, check=True, capture_output=True, text=True).stderr
+        counts.append(int(text.splitlines()[-1].partition(",")[0]) // 1_000_000)
+    return sorted(counts)[1]
+
+
+def print_runs(name: str, contracts: Contracts, runs: int, *, counts_instructions: bool) -> None:
+    """Print the CPU time or the instructions of a run, and what the contracts add to it."""
     manifests = {
         "none": contracts.manifest("none", ""),
         "headers": contracts.manifest("headers", HEADERS),
         "fields": contracts.manifest("fields", HEADERS + contracts.values()),
     }
     commands: dict[str, list[str | Path]] = {key: [*INGEST, path, "-q"] for key, path in manifests.items()}
-    figures = alternate(commands, runs, contracts.folder / "store")
-    plain = figures["none"].cpu_s
-    added = [f"{100 * (figures[key].cpu_s / plain - 1):+.1f} %" for key in ("headers", "fields")]
-    print(f"| {name} | {plain:.2f} s | {added[0]} | {added[1]} |", flush=True)
+    store = contracts.folder / "store"
+    if counts_instructions:
+        costs: dict[str, float] = {key: instructions(command, store) for key, command in commands.items()}
+        cost = f"{costs['none']:,.0f} million"
+    else:
+        costs = {key: sample.cpu_s for key, sample in alternate(commands, runs, store).items()}
+        cost = f"{costs['none']:.2f} s"
+    added = [f"{100 * (costs[key] / costs['none'] - 1):+.1f} %" for key in ("headers", "fields")]
+    print(f"| {name} | {cost} | {added[0]} | {added[1]} |", flush=True)
 
 
 def print_checks(
@@ -173,16 +191,24 @@ def main() -> None:
     parser.add_argument("--tracecheck", help="the program tracecheck")
     parser.add_argument("--pymcap-cli", help="the program pymcap-cli")
     parser.add_argument("--only", action="append", help="one of telemetry, cameras, mixed; repeatable")
+    parser.add_argument(
+        "--instructions",
+        action="store_true",
+        help="count instructions of runs with perf, and skip the checks",
+    )
     arguments = parser.parse_args()
     with tempfile.TemporaryDirectory() as folder:
         recordings = {
             name: Contracts(BY_NAME[name].path(arguments.data), Path(folder))
             for name in arguments.only or RECORDINGS
         }
-        print("| recording | run (CPU) | with rate, gap, latency and stamps | with ten fields, too |")
+        unit = "instructions" if arguments.instructions else "CPU"
+        print(f"| recording | run ({unit}) | with rate, gap, latency and stamps | with ten fields, too |")
         print("|---|---:|---:|---:|")
         for name, contracts in recordings.items():
-            print_runs(name, contracts, arguments.runs)
+            print_runs(name, contracts, arguments.runs, counts_instructions=arguments.instructions)
+        if arguments.instructions:
+            return
         print(
             "\nWall time (CPU time):\n\n| recording | check of times | tracecheck | check of ten fields | pymcap-cli |"
         )
