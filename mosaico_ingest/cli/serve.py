@@ -360,10 +360,11 @@ def watch(
     deadline = time.monotonic() + rest + every if once else float("inf")
     try:
         while True:
+            look_s = time.monotonic()
             complete = _settled(arrivals)
             if complete and not _ingest(manifest, complete, jobs, arrivals, codes, once=once):
                 break
-            if not complete and time.monotonic() > deadline:
+            if not complete and look_s > deadline:  # listing an object store may take longer than the rest
                 break
             time.sleep(every)
     except KeyboardInterrupt:
