@@ -298,7 +298,7 @@ def _draft_manifest(path: str, *, out: Path | None, ros_distro: str | None) -> N
     from mosaico_ingest import api
     from mosaico_ingest.errors import NothingMatched
     from mosaico_ingest.remote import as_path
-    from mosaico_ingest.services.inspection import draft_manifest
+    from mosaico_ingest.services.draft import draft_manifest
 
     inspection = api.inspect_recording(path, ros_distro=ros_distro)
     if not inspection.topics:

@@ -20,7 +20,8 @@ from mosaico_ingest.ontology.registry import ontology_type
 from mosaico_ingest.report.events import RunStatus, TopicStatus
 from mosaico_ingest.report.recording import Rejection, Report, TopicReport
 from mosaico_ingest.report.run import RunReport
-from mosaico_ingest.services.inspection import draft_manifest, estimate_rate_hz
+from mosaico_ingest.services.draft import draft_manifest
+from mosaico_ingest.services.inspection import estimate_rate_hz
 from mosaico_ingest.view.texts import value_text
 
 JOB = Path(__file__).resolve().parents[2] / "configs" / "quickstart.yaml"

@@ -7,7 +7,8 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.remote import as_path
-from mosaico_ingest.services.inspection import InspectedTopic, Inspection, draft_manifest
+from mosaico_ingest.services.draft import draft_manifest
+from mosaico_ingest.services.inspection import InspectedTopic, Inspection
 
 
 def draft(
