@@ -14,6 +14,7 @@ from made_recordings import define, record
 from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError, Unreachable
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
 
 FLOAT = define("made/msg/Float", "float64 data")
@@ -43,7 +44,7 @@ def test_recordings_and_store_of_container_equal_the_files(
         messages = [("/a", FLOAT, 10**9 * second, {"data": float(second)}) for second in range(20)]
         path = record(tmp_path / f"{name}{suffix}", messages)
         service.blobs[f"in/{path.name}"] = path.read_bytes()
-        config = api.ROSInjectionConfig(file_path=path, sequence_name=name, store=tmp_path / "local")
+        config = ROSInjectionConfig(file_path=path, sequence_name=name, store=tmp_path / "local")
         assert api.run([config]).exit_code == 0
     job = tmp_path / "job.yaml"
     manifest = {"bag": {"path": service.url(f"in/*{suffix}")}, "target": {"store": service.url("store")}}

@@ -18,6 +18,7 @@ from mosaico_ingest import api
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import IngestError, ManifestError, NothingMatched, Unreachable
 from mosaico_ingest.findings import mask_credentials
+from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.lint.engine import lint_paths
 from mosaico_ingest.remote import Network, RemotePath, as_path, with_network
 from mosaico_ingest.report.events import RunStatus
@@ -71,7 +72,7 @@ def test_recording_of_web_server_equals_the_file(
     server.files[recording.name] = recording.read_bytes()
     server.ranges = ranges
     assert run(server, tmp_path, recording.name)[0] is RunStatus.COMPLETED
-    api.run([api.ROSInjectionConfig(file_path=recording, sequence_name="local", store=tmp_path / "store")])
+    api.run([ROSInjectionConfig(file_path=recording, sequence_name="local", store=tmp_path / "store")])
     store = Store.open(tmp_path / "store")
     assert store.topic("drive", "/blob").checksum == store.topic("local", "/blob").checksum
     assert {method for method, _ in server.requests} == {"GET"}
