@@ -10,14 +10,16 @@ import errno
 import inspect
 import json
 import os
-from collections.abc import Collection, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Collection, Generator, Iterable, Sequence
+from contextlib import contextmanager, suppress
 from functools import cache
 from html import escape
 from itertools import islice, pairwise
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
-from typing import TYPE_CHECKING, Any, Literal, TypeVar, cast
+from threading import Lock
+from typing import IO, TYPE_CHECKING, Any, Literal, TypeVar, cast
+from weakref import finalize
 
 from pydantic import BaseModel, ConfigDict, GetCoreSchemaHandler, ValidationError, model_validator
 from pydantic.json_schema import GenerateJsonSchema, JsonSchemaValue
@@ -77,17 +79,78 @@ def write_atomically(path: Path, text: str | Iterable[str]) -> None:
         ManifestError: The path is a folder.
         SinkError: The file cannot be written.
     """
-    check_output_file(path)
-    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("w", encoding="utf-8") as file:
-            file.writelines([text] if isinstance(text, str) else text)
-        partial.replace(path)
-    except OSError as error:
-        with suppress(OSError):
-            partial.unlink()
-        raise SinkError(f"cannot be written: {error.strerror}", where=str(path)) from error
+    with AtomicFile(path) as file:
+        for part in [text] if isinstance(text, str) else text:
+            file.write(part)
+
+
+class AtomicFile:
+    """A text file that is written in parts; an existing file stays until the block ends without an error.
+
+    Raises:
+        ManifestError: The path is a folder.
+        SinkError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path) -> None:
+        check_output_file(path)
+        self._path = path
+        self._partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+        with self._translated_errors():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = self._partial.open("w", encoding="utf-8")
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, error: type[BaseException] | None, *_: object) -> None:
+        if error is not None:
+            with suppress(OSError):
+                self._file.close()
+            self._partial.unlink(missing_ok=True)
+            return
+        with self._translated_errors():
+            self._file.close()
+            self._partial.replace(self._path)
+
+    def write(self, text: str) -> None:
+        """Append text."""
+        with self._translated_errors():
+            self._file.write(text)
+
+    @contextmanager
+    def _translated_errors(self) -> Generator[None]:
+        try:
+            yield
+        except OSError as error:
+            with suppress(OSError):
+                self._partial.unlink()
+            raise SinkError(f"cannot be written: {error.strerror}", where=str(self._path)) from error
+
+
+class LineFile:
+    """The lines of a file by their offsets; the file stays open as long as the object is used."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._lock = Lock()
+        self._file: IO[bytes] | None = None
+
+    def read(self, offset: int) -> bytes:
+        """Return the line at an offset.
+
+        Raises:
+            ManifestError: The file cannot be read.
+        """
+        try:
+            with self._lock:
+                if self._file is None:
+                    self._file = self.path.open("rb")
+                    finalize(self, self._file.close)
+                self._file.seek(offset)
+                return self._file.readline()
+        except OSError as error:
+            raise ManifestError(f"cannot be read: {error.strerror}", where=str(self.path)) from error
 
 
 def schema_of(

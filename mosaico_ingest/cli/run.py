@@ -467,7 +467,8 @@ def _streamed_report(files: Sequence[Path], recordings: int, *, resume: bool) ->
     if report_file is not None or recordings <= MAX_REPORTS:
         yield report_file
         return
-    with TemporaryDirectory(prefix="ingest-report-") as folder:
+    # On Windows, the folder of a file that is still open stays.
+    with TemporaryDirectory(prefix="ingest-report-", ignore_cleanup_errors=True) as folder:
         yield Path(folder) / f"report{LINES_SUFFIX}"
 
 

@@ -22,7 +22,7 @@ from pydantic import AfterValidator, BaseModel, Field, ValidationError, computed
 from typing_extensions import Self
 
 from mosaico_ingest.display import count_text, counted
-from mosaico_ingest.documents import document_schema, html_table, read_document
+from mosaico_ingest.documents import LineFile, document_schema, html_table, read_document
 from mosaico_ingest.errors import ManifestError, SinkError, gravest
 from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
@@ -371,6 +371,7 @@ class _Index:
 
     def __init__(self, path: Path) -> None:
         self.path = path
+        self._lines = LineFile(path)
         self.end = 0
         """The offset behind the last complete line."""
         self.summary: Summary | None = None
@@ -451,12 +452,7 @@ class _Index:
 
     def _recording(self, position: int) -> Report:
         offset = self._offsets[position]
-        try:
-            with self.path.open("rb") as file:
-                file.seek(offset)
-                line = file.readline()
-        except OSError as error:
-            raise ManifestError(f"cannot be read: {error.strerror}", where=str(self.path)) from error
+        line = self._lines.read(offset)
         return self._parse(line, Report, f"byte {offset}")
 
     def _parse(self, line: bytes, model: type[_Model], position: str) -> _Model:
