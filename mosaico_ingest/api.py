@@ -346,6 +346,8 @@ def run(
         return RunReport(tool=tool, manifests=tuple(manifests), recordings=recordings)
     from mosaico_ingest.report.run import Header, ReportWriter
 
+    if resume:
+        _refuse_shared_lines(tasks)
     with ReportWriter(report, Header(tool=tool, manifests=tuple(manifests)), resume=resume) as writer:
         if resume:
             tasks = tasks.map(_skipping_task)
@@ -353,6 +355,24 @@ def run(
         for recording in executor.map(candidates, observe):
             writer.add(recording)
         return writer.finish()
+
+
+def _refuse_shared_lines(tasks: LazySequence[Task]) -> None:
+    """Raise ManifestError if several manifests write a sequence, whose recordings would share a line of the report."""
+    if len(tasks.samples) < 2:  # noqa: PLR2004 - the names of one manifest differ
+        return
+    from mosaico_ingest.destinations.base import destination_of
+
+    keys: set[tuple[str, str]] = set()
+    for job in (task.job for task in tasks):
+        key = (job.sequence.name, destination_of(job.destination).describe())
+        if key in keys:
+            raise ManifestError(
+                f"several recordings of the run write the sequence {job.sequence.name!r}",
+                where=job.origin.file,
+                hint="resume each manifest with a report of its own, because a report resumes by sequence",
+            )
+        keys.add(key)
 
 
 def _tasks(jobs: Sequence[Job | Task | ROSInjectionConfig]) -> LazySequence[Task]:

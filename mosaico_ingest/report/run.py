@@ -24,6 +24,7 @@ from typing_extensions import Self
 from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.documents import LineFile, document_schema, html_table, read_document
 from mosaico_ingest.errors import ManifestError, SinkError, gravest
+from mosaico_ingest.findings import join_names
 from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.report.events import SUCCESSFUL, RunStatus
 from mosaico_ingest.report.parts import ReportPart
@@ -196,7 +197,7 @@ class ReportWriter:
     gets no other line.
 
     Raises:
-        ManifestError: The path has another suffix, or the file to continue is not a report.
+        ManifestError: The path has another suffix, or the file to continue is not a report, or one of another job.
         SinkError: The file cannot be written, or another run is writing it.
     """
 
@@ -218,6 +219,7 @@ class ReportWriter:
             if resume:
                 with path.open("rb") as file:
                     self._finished = self._index.read(file).finished
+                self._index.refuse_other_job(header)
             self._file.truncate(self._index.end)  # also removes a line that a killed run did not complete
         except BaseException as error:
             self._file.close()
@@ -418,6 +420,27 @@ class _Index:
         self._offsets.append(self.end)
         self._keys.append(_key(sequence, destination))
         self._codes.append(exit_code)
+
+    def refuse_other_job(self, header: Header) -> None:
+        """Raise ManifestError if the file has recordings of other manifests than those of a run that continues it.
+
+        A manifest is the same if its file or its content is.
+        """
+        earlier = [*self._manifests]
+        others = [
+            manifest.path
+            for manifest in header.manifests
+            if not any(
+                manifest.text == one.text or Path(manifest.path).absolute() == Path(one.path).absolute()
+                for one in earlier
+            )
+        ]
+        if earlier and others:
+            raise ManifestError(
+                f"the report has recordings of {join_names(one.path for one in earlier)}, not of {join_names(others)}",
+                where=str(self.path),
+                hint="name another file with --report, or resume with the manifests of the report",
+            )
 
     @property
     def finished(self) -> set[int]:

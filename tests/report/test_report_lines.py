@@ -196,3 +196,28 @@ def test_resume_continues_the_report_of_the_command_line(job: Path) -> None:
 
 def test_resume_without_lines_is_refused(job: Path) -> None:
     assert ingest("run", job, "--resume", "--report", job.parent / "run.json").exit_code == 2
+
+
+def test_resume_with_the_report_of_another_job_is_refused_and_keeps_the_report(job: Path) -> None:
+    other, file = job.with_name("other.yaml"), job.parent / "run.jsonl"
+    api.run(job, report=file)
+    lines = file.read_bytes()
+    other.write_text(job.read_text().replace("{stem}", "{stem}_again"))
+    with pytest.raises(ManifestError, match=r"job\.yaml, not of .*other\.yaml"):
+        api.run(other, report=file, resume=True)
+    assert file.read_bytes() == lines
+    job.rename(other)  # the same content under another name
+    assert api.run(other, report=file, resume=True).summary.resumed == 3
+
+
+def test_resume_of_manifests_that_write_one_sequence_is_refused(job: Path) -> None:
+    job.write_text(job.read_text().replace('"{stem}"', '"{stem}", if_exists: append'))
+    second = job.with_name("second.yaml")
+    second.write_text(job.read_text().replace("/imu", "/gps/fix"))
+    file = job.parent / "run.jsonl"
+    arguments = ("run", job, second, "--report", file, "--quiet")
+    assert ingest(*arguments).exit_code == 0
+    result = CliRunner().invoke(command_line(), [*map(str, arguments), "--resume"])
+    assert isinstance(result.exception, ManifestError)
+    assert "'a'" in str(result.exception)
+    assert len(read_report(file).recordings) == 6
