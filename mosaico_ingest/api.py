@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from mosaico_ingest.executors.base import Executor
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.pipeline.plan import Plan
-    from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument
+    from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument, RecordingPlan
     from mosaico_ingest.services.check import Checked
     from mosaico_ingest.services.inspection import Inspection
     from mosaico_ingest.services.status import RecordingStatus
@@ -49,8 +49,8 @@ __all__ = [
     "compile_recording",
     "inspect_recording",
     "job_status",
-    "plan_differences",
     "plan_job",
+    "plan_recordings",
     "quick_config",
     "run",
     "used_manifest",
@@ -226,6 +226,21 @@ def check_sequence(store: str, sequence: str, expect: Path) -> Checked:
     return check(store, sequence, expect)
 
 
+def plan_recordings(
+    manifest: Path | str, *, jobs: Sequence[Job] | None = None, connect: bool = False
+) -> Iterator[RecordingPlan]:
+    """Yield the plan of each recording of a manifest with the result of a sample of each topic; write nothing.
+
+    A server is contacted only with `connect`. `jobs` avoids compiling the manifest a second time.
+
+    Raises:
+        IngestError: Recordings cannot be planned; raised after the plans of the others.
+    """
+    from mosaico_ingest.pipeline.preview import plan_recordings
+
+    return plan_recordings(jobs or compile_job(Path(manifest)), connect=connect)
+
+
 def plan_job(
     manifest: Path | str,
     *,
@@ -233,30 +248,17 @@ def plan_job(
     folder: Path | None = None,
     connect: bool = False,
 ) -> PlanDocument:
-    """Return the plan of a manifest with the result of a sample of each topic; write nothing.
+    """Return the plans of all recordings of a manifest as one document; see `plan_recordings`.
 
-    Paths in the document are relative to `folder` (default: the current directory). A server is contacted only with
-    `connect`. `jobs` avoids compiling the manifest a second time.
+    Paths in the document are relative to `folder` (default: the current directory).
 
     Raises:
         IngestError: A recording cannot be planned.
     """
-    from mosaico_ingest.pipeline.preview import plan_document
+    from mosaico_ingest.pipeline.preview import plan_frame
 
-    path = Path(manifest)
-    return plan_document(jobs or compile_job(path), manifest=path, folder=folder or Path(), connect=connect)
-
-
-def plan_differences(path: Path, document: PlanDocument) -> tuple[Difference, ...]:
-    """Return the differences between the decisions of a plan file and those of a document.
-
-    Raises:
-        ManifestError: The file is not a plan.
-    """
-    from mosaico_ingest.pipeline.plan_document import differences, read_plan
-
-    before = [recording.plan for recording in read_plan(path).recordings]
-    return differences(before, [recording.plan for recording in document.recordings])
+    recordings = tuple(plan_recordings(manifest, jobs=jobs, connect=connect))
+    return plan_frame(Path(manifest), folder or Path()).replace(recordings=recordings)
 
 
 def compare_jobs(before: Path, after: Path) -> tuple[Difference, ...]:

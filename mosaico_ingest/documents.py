@@ -10,13 +10,14 @@ import errno
 import inspect
 import json
 import os
-from collections.abc import Collection, Generator, Iterable, Sequence
+from collections.abc import Callable, Collection, Generator, Iterable, Sequence
 from contextlib import contextmanager, suppress
 from functools import cache
 from html import escape
 from itertools import islice, pairwise
 from pathlib import Path
 from stat import S_ISDIR, S_ISREG
+from textwrap import indent
 from threading import Lock
 from typing import IO, TYPE_CHECKING, Any, Literal, TypeVar, cast
 from weakref import finalize
@@ -126,6 +127,29 @@ class AtomicFile:
             with suppress(OSError):
                 self._partial.unlink()
             raise SinkError(f"cannot be written: {error.strerror}", where=str(self._path)) from error
+
+
+class JsonListWriter:
+    """Writes a JSON document item by item: `text` with two spaces of indent, whose last empty list gets the items.
+
+    Nothing is written before the first item or the end.
+    """
+
+    def __init__(self, write: Callable[[str], object], text: str) -> None:
+        self._write = write
+        self._start, _, self._end = text.rpartition("]")
+        last_line = self._start.rpartition("\n")[2]
+        self._indent = last_line[: len(last_line) - len(last_line.lstrip())]
+        self.has_items = False
+
+    def add(self, item: str) -> None:
+        """Write an item, the text of a JSON value with two spaces of indent."""
+        self._write(f"{',' if self.has_items else self._start}\n{indent(item, f'{self._indent}  ')}")
+        self.has_items = True
+
+    def finish(self) -> None:
+        """Write the end of the document."""
+        self._write(f"\n{self._indent}]{self._end}\n" if self.has_items else f"{self._start}]{self._end}\n")
 
 
 class LineFile:

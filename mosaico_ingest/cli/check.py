@@ -2,30 +2,45 @@
 
 from __future__ import annotations
 
+import json
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack
 from enum import Enum
 from pathlib import Path
+from types import TracebackType
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 from msgspec import Struct
 from rich.text import Text
+from typing_extensions import Self
 
-from mosaico_ingest.cli.console import Terminal, print_json, print_line, read_sources, render_findings
-from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, JunitOption, SarifOption, write_output
+from mosaico_ingest.cli.console import Terminal, print_line, read_sources, render_findings
+from mosaico_ingest.cli.options import (
+    DEFAULT_STORE,
+    JsonOption,
+    JunitOption,
+    SarifOption,
+    output_file,
+    write_output,
+)
 from mosaico_ingest.display import counted
+from mosaico_ingest.errors import IngestError, gravest
 from mosaico_ingest.findings import Finding, Severity, join_names, nearest
+from mosaico_ingest.lazy import LazySequence
 
 if TYPE_CHECKING:
     from mosaico_ingest.lint.engine import LintReport
     from mosaico_ingest.lint.formats import Case, Suite
-    from mosaico_ingest.pipeline.plan_document import RecordingPlan
     from mosaico_ingest.report.parts import ContractResult, ExpectationResult
-    from mosaico_ingest.report.run import RunReport
+    from mosaico_ingest.report.recording import Report
     from mosaico_ingest.services.check import Checked
+
+MAX_FINDINGS = 5000
+"""Findings in a SARIF file; services show no more of one file."""
 
 
 def check(
@@ -75,34 +90,43 @@ def check(
     """
     from mosaico_ingest import api
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
-    from mosaico_ingest.errors import gravest
+    from mosaico_ingest.documents import JsonListWriter
     from mosaico_ingest.pipeline.contract_check import needs_times_only
 
     collect_garbage_as_usual()
     if expect is None and store is not None:
         raise typer.BadParameter("--store needs --expect FILE", param_hint="--store")
-    checked: list[Checked] = []
     jobs = api.compile_job(Path(target)) if expect is None else ()
-    if not (jobs and all(map(needs_times_only, jobs))):
+    if not (jobs and all(map(needs_times_only, LazySequence.of(jobs).samples))):
         hide_pandas(jobs)
     results = (
         api.check_recordings(Path(target), jobs=jobs)
         if expect is None
         else [api.check_sequence(store or DEFAULT_STORE, target, expect)]
     )
-    for one in results:
-        checked.append(one)
-        if not as_json:
-            _print(one, show_all=show_all)
-    if as_json:
-        print_json([_document(one) for one in checked])
-    if junit is not None or sarif is not None:
-        _write_ci_files(checked, junit, sarif)
+    codes: set[int] = set()
+    counts = None
     if metrics is not None:
-        from mosaico_ingest.report.summaries import contract_metrics
+        from mosaico_ingest.report.summaries import ContractCounts
 
-        write_output(metrics, contract_metrics([one.contract for one in checked if one.contract is not None]))
-    code = gravest([one.exit_code for one in checked])
+        counts = ContractCounts()
+    printed = JsonListWriter(sys.stdout.write, "[]")
+    with CiFiles(junit, sarif) as ci:
+        for one in results:
+            codes.add(one.exit_code)
+            if counts is not None and one.contract is not None:
+                counts.add(one.contract)
+            error = None if one.error is None else str(one.error)
+            ci.add(CheckedRecording(one.name, one.contract, error, one.findings))
+            if as_json:
+                printed.add(json.dumps(_document(one), indent=2, ensure_ascii=False, default=str))
+            else:
+                _print(one, show_all=show_all)
+        if as_json:
+            printed.finish()
+    if metrics is not None and counts is not None:
+        write_output(metrics, counts.gauges())
+    code = gravest(codes)
     if code:
         raise typer.Exit(code)
 
@@ -118,39 +142,67 @@ class CheckedRecording(Struct, frozen=True):
     """The findings of the error."""
 
 
-def write_ci_files(recordings: Sequence[CheckedRecording], *, junit: Path | None, sarif: Path | None) -> None:
-    """Write the files of `--junit` and `--sarif`.
+class CiFiles:
+    """The files of `--junit` and `--sarif`: test suites are written one by one, and findings are kept up to a limit.
+
+    The files are also written if an `IngestError` ends the block.
 
     Raises:
         SinkError: A file cannot be written.
     """
-    from mosaico_ingest.lint.formats import junit_text, sarif_text  # take 30 ms to import
 
-    if junit is not None:
-        write_output(junit, junit_text(map(_suite, recordings)))
-    if sarif is not None:
-        findings = dict.fromkeys(finding for one in recordings for finding in _findings(one))
-        write_output(sarif, sarif_text(tuple(findings)))
+    def __init__(self, junit: Path | None, sarif: Path | None) -> None:
+        self._junit, self._sarif = junit, sarif
+        self._files = ExitStack()
+        self._write: Callable[[str], object] | None = None
+        self._findings: dict[Finding, None] = {}
+        self._more = 0
+
+    def __enter__(self) -> Self:
+        if self._junit is not None:
+            from mosaico_ingest.lint.formats import JUNIT_START  # takes 30 ms to import
+
+            self._write = self._files.enter_context(output_file(self._junit))
+            self._write(JUNIT_START)
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if kind is not None and not issubclass(kind, IngestError):
+            self._files.__exit__(kind, error, trace)
+            return
+        if self._write is not None:
+            from mosaico_ingest.lint.formats import JUNIT_END
+
+            self._write(JUNIT_END)
+        self._files.close()
+        if self._sarif is not None:
+            from mosaico_ingest.lint.formats import sarif_text
+
+            write_output(self._sarif, sarif_text(tuple(self._findings)))
+            if self._more:
+                more = f"{self._sarif}: the first {MAX_FINDINGS:,} findings; {counted(self._more, 'more finding')}"
+                print_line(more, style="yellow", stderr=True)
+
+    def add(self, recording: CheckedRecording) -> None:
+        """Add the outcome of a recording."""
+        if self._write is not None:
+            from mosaico_ingest.lint.formats import suite_text
+
+            self._write(suite_text(_suite(recording)))
+        if self._sarif is not None:
+            for finding in _findings(recording):
+                if len(self._findings) < MAX_FINDINGS:
+                    self._findings[finding] = None
+                else:
+                    self._more += finding not in self._findings
 
 
-def run_outcomes(report: RunReport) -> list[CheckedRecording]:
-    """Return the outcome of each recording of a run."""
-    return [
-        CheckedRecording(
-            recording.sequence,
-            recording.contract,
-            recording.error,
-            tuple(each.finding for each in recording.error_findings),
-        )
-        for recording in report.recordings
-    ]
-
-
-def plan_outcomes(recordings: Sequence[RecordingPlan]) -> list[CheckedRecording]:
-    """Return the outcome of each planned recording: what the index and the sample reveal about its contract."""
-    return [
-        CheckedRecording(recording.plan["sequence"]["name"], recording.contract) for recording in recordings
-    ]
+def run_outcome(recording: Report) -> CheckedRecording:
+    """Return the outcome of a recording of a run."""
+    findings = tuple(each.finding for each in recording.error_findings)
+    return CheckedRecording(recording.sequence, recording.contract, recording.error, findings)
 
 
 class OutputFormat(str, Enum):
@@ -210,14 +262,6 @@ def lint(
         typer.echo(FORMATS[output_format.value](report), nl=False)
     if report.exit_code and (output_format is not OutputFormat.SARIF or not report.files):
         raise typer.Exit(report.exit_code)
-
-
-def _write_ci_files(checked: Sequence[Checked], junit: Path | None, sarif: Path | None) -> None:
-    recordings = [
-        CheckedRecording(one.name, one.contract, None if one.error is None else str(one.error), one.findings)
-        for one in checked
-    ]
-    write_ci_files(recordings, junit=junit, sarif=sarif)
 
 
 def _print(one: Checked, *, show_all: bool) -> None:

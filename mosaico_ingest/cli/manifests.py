@@ -351,11 +351,11 @@ def _ci_files(manifest: Path, junit: Path | None, sarif: Path | None) -> Generat
         raise
     finally:
         if junit is not None or sarif is not None:
-            from mosaico_ingest.cli.check import CheckedRecording, write_ci_files
+            from mosaico_ingest.cli.check import CheckedRecording, CiFiles
 
             text, findings = (None, ()) if error is None else (str(error), error.findings)
-            outcome = CheckedRecording(f"schema lock {manifest}", error=text, findings=findings)
-            write_ci_files([outcome], junit=junit, sarif=sarif)
+            with CiFiles(junit, sarif) as files:
+                files.add(CheckedRecording(f"schema lock {manifest}", error=text, findings=findings))
 
 
 def _schema_text(document: Document) -> str:

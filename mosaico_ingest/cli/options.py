@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Generator, Iterable
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Annotated
 
@@ -105,6 +106,24 @@ SarifOption = Annotated[
 ]
 
 
+@contextmanager
+def output_file(path: Path) -> Generator[Callable[[str], object]]:
+    """Yield the function that appends text to the file of an output option, or to standard output if the path is `-`.
+
+    The file replaces an existing one when the block ends without an error.
+
+    Raises:
+        SinkError: The file cannot be written.
+    """
+    if path == STANDARD_OUTPUT:
+        yield sys.stdout.write
+        return
+    from mosaico_ingest.documents import AtomicFile
+
+    with AtomicFile(path) as file:
+        yield file.write
+
+
 def write_output(path: Path, text: str | Iterable[str], *, announce: bool = False) -> None:
     """Write the text of an output option: to a file, or to standard output if the path is `-`.
 
@@ -113,13 +132,10 @@ def write_output(path: Path, text: str | Iterable[str], *, announce: bool = Fals
     Raises:
         SinkError: The file cannot be written.
     """
-    from mosaico_ingest.documents import write_atomically
-
-    if path == STANDARD_OUTPUT:
-        sys.stdout.writelines([text] if isinstance(text, str) else text)
-        return
-    write_atomically(path, text)
-    if announce:
+    with output_file(path) as write:
+        for part in [text] if isinstance(text, str) else text:
+            write(part)
+    if announce and path != STANDARD_OUTPUT:
         from mosaico_ingest.cli.console import print_line
 
         print_line(f"wrote {path}", stderr=True)

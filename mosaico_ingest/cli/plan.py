@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, contextmanager
 from os.path import normpath
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,11 +19,12 @@ from mosaico_ingest.cli.options import (
     JunitOption,
     ManifestArgument,
     SarifOption,
-    write_output,
+    output_file,
 )
 from mosaico_ingest.display import bytes_text, counted, seconds_text, time_text
-from mosaico_ingest.errors import IngestError
+from mosaico_ingest.errors import IngestError, gravest
 from mosaico_ingest.findings import Severity, join_names
+from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.remote import is_url
 
 if TYPE_CHECKING:
@@ -29,7 +32,6 @@ if TYPE_CHECKING:
         DestinationState,
         Difference,
         Note,
-        PlanDocument,
         RecordingPlan,
         Sample,
     )
@@ -43,7 +45,9 @@ def plan(
     out: Annotated[
         Path | None,
         typer.Option(
-            "--out", help="Write the plan as JSON, for `run --plan`; - writes it to stdout.", metavar="FILE"
+            "--out",
+            help="Write the plan as JSON, or JSON Lines (FILE.jsonl), for `run --plan`; - writes it to stdout.",
+            metavar="FILE",
         ),
     ] = None,
     check: Annotated[
@@ -63,62 +67,122 @@ def plan(
     4 messages would be rejected, 6 a contract is violated.
     """
     from mosaico_ingest import api
+    from mosaico_ingest.cli.check import CheckedRecording, CiFiles
     from mosaico_ingest.cli.process import collect_garbage_as_usual, hide_pandas
 
     collect_garbage_as_usual()
-    try:
-        jobs = api.compile_job(manifest)
-        hide_pandas(jobs)
-        document = api.plan_job(manifest, jobs=jobs, folder=out.parent if out else None, connect=connect)
-    except IngestError as error:
-        _write_ci_files([], junit=junit, sarif=sarif, manifest=manifest, error=error)
-        raise
-    _write_ci_files(document.recordings, junit=junit, sarif=sarif, manifest=manifest)
-    if out is not None:
-        write_output(out, document.model_dump_json(indent=2) + "\n")
-    if out == STANDARD_OUTPUT:
-        pass  # the tables would mix with the JSON
-    elif as_json:
-        typer.echo(document.model_dump_json(indent=2))
-    elif check is None:
-        print_plan(document, folder=manifest.parent)
-    code = document.exit_code
-    if check is not None:
-        differences = api.plan_differences(check, document)
-        if not as_json and out != STANDARD_OUTPUT:
-            print_differences(differences)
-        code = 1 if differences else 0
+    prints = out != STANDARD_OUTPUT and not as_json  # tables would mix with the JSON
+    with CiFiles(junit, sarif) as ci:
+        try:
+            jobs = api.compile_job(manifest)
+            hide_pandas(jobs)
+            shown = (
+                PlanTables(manifest.parent, prints=prints)
+                if check is None
+                else PlanDifferences(check, prints=prints)
+            )
+            with _documents(manifest, out, as_json=as_json) as write:
+                for recording in api.plan_recordings(manifest, jobs=jobs, connect=connect):
+                    write(recording)
+                    ci.add(CheckedRecording(recording.plan["sequence"]["name"], recording.contract))
+                    shown.add(recording)
+        except IngestError as error:
+            ci.add(CheckedRecording(str(manifest), None, str(error), error.findings))
+            raise
+    code = shown.finish()
     if code:
         raise typer.Exit(code)
 
 
-def _write_ci_files(
-    recordings: Sequence[RecordingPlan],
-    *,
-    junit: Path | None,
-    sarif: Path | None,
-    manifest: Path,
-    error: IngestError | None = None,
-) -> None:
-    """Write the files of `--junit` and `--sarif`: an outcome for each planned recording, or the error of the plan."""
-    if junit is not None or sarif is not None:
-        from mosaico_ingest.cli.check import CheckedRecording, plan_outcomes, write_ci_files
+@contextmanager
+def _documents(
+    manifest: Path, out: Path | None, *, as_json: bool
+) -> Generator[Callable[[RecordingPlan], None]]:
+    """Yield the function that writes a recording to the plan file, to standard output, or to both.
 
-        outcomes = plan_outcomes(recordings)
-        if error is not None:
-            outcomes.append(CheckedRecording(str(manifest), None, str(error), error.findings))
-        write_ci_files(outcomes, junit=junit, sarif=sarif)
+    If recordings cannot be planned, the file is not written, and the document on standard output has the others.
+    """
+    from mosaico_ingest.pipeline.plan_document import LINES_SUFFIX, PlanWriter
+    from mosaico_ingest.pipeline.preview import plan_frame
+
+    frame = plan_frame(manifest, out.parent if out else Path())
+    writers: list[PlanWriter] = []
+
+    def write(recording: RecordingPlan) -> None:
+        for writer in writers:
+            writer.add(recording)
+
+    with ExitStack() as stack:
+        if out is not None:
+            is_lines = out.suffix == LINES_SUFFIX
+            writers.append(PlanWriter(stack.enter_context(output_file(out)), frame, lines=is_lines))
+        if as_json and out != STANDARD_OUTPUT:
+            writers.append(PlanWriter(sys.stdout.write, frame))
+        try:
+            yield write
+        except IngestError:
+            for writer in writers:
+                if writer.has_items:
+                    writer.finish()
+            raise
+        for writer in writers:
+            writer.finish()
 
 
-def print_plan(document: PlanDocument, *, folder: Path) -> None:
-    """Print the plan of every recording, with paths relative to `folder`, the manifest's folder."""
-    for recording in document.recordings:
-        _print_recording(recording, folder)
-    if len(document.recordings) > 1:
-        size = sum(
-            file["size_bytes"] for recording in document.recordings for file in recording.plan["files"]
-        )
-        print_line(f"{counted(len(document.recordings), 'recording')}, {bytes_text(size)}", style="bold")
+class PlanTables:
+    """Prints the plan of each recording, with paths relative to `folder`, the manifest's folder."""
+
+    def __init__(self, folder: Path, *, prints: bool = True) -> None:
+        self._folder, self._prints = folder, prints
+        self._count = self._bytes = 0
+        self._codes: set[int] = set()
+
+    def add(self, recording: RecordingPlan) -> None:
+        """Print the plan of a recording."""
+        self._count += 1
+        self._bytes += sum(file["size_bytes"] for file in recording.plan["files"])
+        self._codes.add(recording.exit_code)
+        if self._prints:
+            _print_recording(recording, self._folder)
+
+    def finish(self) -> int:
+        """Print the number and size of the recordings if there are several, and return the exit code."""
+        if self._prints and self._count > 1:
+            print_line(f"{counted(self._count, 'recording')}, {bytes_text(self._bytes)}", style="bold")
+        return gravest(self._codes)
+
+
+class PlanDifferences:
+    """Prints the differences of the plans from those of a plan file."""
+
+    def __init__(self, file: Path, *, prints: bool) -> None:
+        from mosaico_ingest.pipeline.plan_document import PlanComparison, read_plan
+
+        before = LazySequence.of(read_plan(file).recordings).map(_plan_of)
+        self._comparison = PlanComparison(before)
+        self._prints = prints
+        self._count = 0
+
+    def add(self, recording: RecordingPlan) -> None:
+        """Print the differences of the plan of a recording."""
+        self._print(self._comparison.add(recording.plan))
+
+    def finish(self) -> int:
+        """Print the differences of new and missing recordings, and return the exit code."""
+        self._print(self._comparison.finish())
+        if self._prints and not self._count:
+            _print_equal()
+        return int(self._count > 0)
+
+    def _print(self, differences: Iterable[Difference]) -> None:
+        for difference in differences:
+            self._count += 1
+            if self._prints:
+                _print_difference(difference)
+
+
+def _plan_of(recording: RecordingPlan) -> Mapping[str, Any]:
+    return recording.plan
 
 
 def _print_recording(recording: RecordingPlan, folder: Path) -> None:
@@ -245,15 +309,19 @@ def diff(
     if as_json:
         print_json([to_builtins(difference) for difference in differences])
     else:
-        print_differences(differences)
+        for difference in differences:
+            _print_difference(difference)
+        if not differences:
+            _print_equal()
     if differences:
         raise typer.Exit(1)
 
 
-def print_differences(differences: Sequence[Difference]) -> None:
-    """Print a line for each difference: added in green, removed in red, changed in yellow."""
-    for difference in differences:
-        style = "green" if difference.before is None else "red" if difference.after is None else "yellow"
-        print_line(str(difference), style=style)
-    if not differences:
-        print_line("the plans are equal", style="green")
+def _print_difference(difference: Difference) -> None:
+    """Print a difference: added in green, removed in red, changed in yellow."""
+    style = "green" if difference.before is None else "red" if difference.after is None else "yellow"
+    print_line(str(difference), style=style)
+
+
+def _print_equal() -> None:
+    print_line("the plans are equal", style="green")

@@ -94,9 +94,11 @@ class _ResultFiles(Struct, frozen=True):
         if self.metrics is not None:
             write_output(self.metrics, prometheus_text(report))
         if self.junit is not None or self.sarif is not None:
-            from mosaico_ingest.cli.check import run_outcomes, write_ci_files
+            from mosaico_ingest.cli.check import CiFiles, run_outcome
 
-            write_ci_files(run_outcomes(report), junit=self.junit, sarif=self.sarif)
+            with CiFiles(self.junit, self.sarif) as files:
+                for recording in report.recordings:
+                    files.add(run_outcome(recording))
 
 
 def run(
@@ -290,11 +292,12 @@ def bag(
     ).job
     hide_pandas([job])
     if dry_run:
-        from mosaico_ingest.cli.plan import print_plan
+        from mosaico_ingest.cli.plan import PlanTables
 
-        document = api.plan_job(Path(), jobs=[job])
-        print_plan(document, folder=Path())
-        raise typer.Exit(document.exit_code)
+        tables = PlanTables(Path())
+        for recording in api.plan_recordings(Path(), jobs=[job]):
+            tables.add(recording)
+        raise typer.Exit(tables.finish())
     run_tasks([Task(job)], report=report, quiet=quiet, log=log)
 
 

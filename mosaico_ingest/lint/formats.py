@@ -16,6 +16,8 @@ from mosaico_ingest.lint.engine import LintedFile, LintReport
 from mosaico_ingest.rules import RULES, Rule, page_of
 from mosaico_ingest.version import __version__
 
+JUNIT_START = '<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n'
+JUNIT_END = "</testsuites>\n"
 _COMMANDS = {Severity.ERROR: "error", Severity.WARNING: "warning", Severity.INFO: "notice"}
 _ESCAPES = (("%", "%25"), ("\r", "%0D"), ("\n", "%0A"))
 _NOT_XML = re.compile(r"[^\t\n\r\x20-\ud7ff\ue000-\ufffd\U00010000-\U0010ffff]")
@@ -101,8 +103,7 @@ class Suite(Struct, frozen=True):
 
 def junit_text(suites: Iterable[Suite]) -> str:
     """Return test suites as JUnit XML."""
-    texts = "".join(map(_suite, suites))
-    return f'<?xml version="1.0" encoding="UTF-8"?>\n<testsuites>\n{texts}</testsuites>\n'
+    return f"{JUNIT_START}{''.join(map(suite_text, suites))}{JUNIT_END}"
 
 
 def _render_junit(report: LintReport) -> str:
@@ -124,7 +125,8 @@ def _case_name(finding: Finding, file: str) -> str:
     return f"{location} {finding.rule}"
 
 
-def _suite(suite: Suite) -> str:
+def suite_text(suite: Suite) -> str:
+    """Return a test suite as a part of JUnit XML, between `JUNIT_START` and `JUNIT_END`."""
     failures = sum(case.failure is not None for case in suite.cases)
     skipped = sum(case.skipped is not None for case in suite.cases)
     counts = f'tests="{len(suite.cases)}" failures="{failures}" skipped="{skipped}"'

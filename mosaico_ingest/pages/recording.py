@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -111,18 +112,38 @@ class ContractSummary(Struct, frozen=True):
     """Number of recordings by outcome, the gravest first."""
 
 
-def contract_summaries(recordings: Sequence[Report]) -> list[ContractSummary]:
-    """Return the results by expectation and topic, those with the gravest outcome first."""
-    groups: dict[tuple[str, str | None], list[ContractRow]] = {}
-    for at, report in enumerate(recordings):
+class ContractSummaries:
+    """The results of expectations, collected recording by recording."""
+
+    def __init__(self) -> None:
+        self._groups: dict[tuple[str, str | None], tuple[ContractRow, Counter[str]]] = {}
+
+    def add(self, at: int, report: Report) -> None:
+        """Add the results of a recording."""
         for row in contract_rows(f"r{at}", report):
-            groups.setdefault((row.result.expectation, row.result.topic), []).append(row)
-    summaries: list[ContractSummary] = []
-    for rows in groups.values():
-        counts = {word: sum(row.word == word for row in rows) for word in OUTCOMES}
-        gravest = min(rows, key=lambda row: OUTCOMES[row.word])
-        summaries.append(ContractSummary(gravest, {word: count for word, count in counts.items() if count}))
-    return sorted(summaries, key=lambda summary: OUTCOMES[summary.row.word])
+            key = (row.result.expectation, row.result.topic)
+            gravest, counts = self._groups.get(key, (row, Counter[str]()))
+            counts[row.word] += 1
+            self._groups[key] = (row if OUTCOMES[row.word] < OUTCOMES[gravest.word] else gravest, counts)
+
+    def summaries(self) -> list[ContractSummary]:
+        """Return the results by expectation and topic, those with the gravest outcome first."""
+        summaries = [
+            ContractSummary(row, {word: counts[word] for word in OUTCOMES if counts[word]})
+            for row, counts in self._groups.values()
+        ]
+        return sorted(summaries, key=lambda summary: OUTCOMES[summary.row.word])
+
+
+def problem_rank(report: Report) -> int:
+    """Return 0 without problems, 1 with missing messages or warnings, 2 if failed or with a violated contract."""
+    contract = report.contract
+    if report.status in FAILED or (contract is not None and contract.errors):
+        return 2
+    is_incomplete = (
+        report.status is RunStatus.WITH_ERRORS or report.totals.rejected or report.unreadable_ranges
+    )
+    return int(bool(is_incomplete or (contract is not None and contract.warnings)))
 
 
 class StepShare(Struct, frozen=True):
@@ -159,15 +180,9 @@ class RecordingView:
         self.violations = len(contract.errors) if contract else 0
         self.warnings = len(contract.warnings) if contract else 0
         self.totals = report.totals
-        is_incomplete = bool(
-            report.status is RunStatus.WITH_ERRORS or self.totals.rejected or report.unreadable_ranges
-        )
-        self.rank = (
-            2 if report.status in FAILED or self.violations else int(is_incomplete or self.warnings > 0)
-        )
-        """0 without problems, 1 with missing messages or warnings, 2 if failed or with a violated contract."""
+        self.rank = problem_rank(report)
         self.written = report.written_text
-        self.unreadable = unreadable_text([report])
+        self.unreadable = unreadable_text(report)
         self._run, self._folder = run, folder
 
     @property

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from array import array
+from collections import Counter
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from heapq import nlargest
 from pathlib import Path
 
 from markupsafe import Markup
@@ -13,13 +16,14 @@ from mosaico_ingest.display import bytes_text, count_text, counted, percent_text
 from mosaico_ingest.pages.design import macro, pack, render
 from mosaico_ingest.pages.recording import (
     FAILED,
+    ContractSummaries,
     RecordingView,
     StepShare,
-    contract_summaries,
+    problem_rank,
     step_shares,
 )
 from mosaico_ingest.report.events import RunStatus, TopicStatus
-from mosaico_ingest.report.recording import Report, slowest, step_seconds, unreadable_text
+from mosaico_ingest.report.recording import Report, at_least_text, step_seconds
 from mosaico_ingest.report.run import RunReport, replay_command
 from mosaico_ingest.report.summaries import Comparison
 from mosaico_ingest.rules import RULES
@@ -30,6 +34,10 @@ MAX_ROWS = 50
 """Recordings above which the list is packed, except for its start."""
 PACK_SIZE = 25
 """Recordings whose content is packed together."""
+MAX_LISTED = 5000
+"""Recordings that the page lists; those with problems come first."""
+MAX_PROBLEMS = 500
+"""Different problems that the page lists."""
 MAX_SLOWEST = 10
 MAX_RESULTS = 200
 """Expectations that the table lists; failed ones come first."""
@@ -51,24 +59,24 @@ def run_page(
 
     `list_link` is the address of the list of runs of a web server, which has no links to files.
     """
-    several = len(report.recordings) > 1
+    overview = _Overview(report)
     started_at = report.summary.started_at
-    expectations = contract_summaries(report.recordings)
+    expectations = overview.contracts.summaries()
     return render(
         "run.html",
         report=report,
         list_link=list_link,
-        verdict=verdict_of(report.recordings),
-        problems=run_problems(report),
+        verdict=overview.verdict.verdict(),
+        problems=overview.problems.problems(),
         expectations=expectations[:MAX_RESULTS],
         expectation_count=len(expectations),
         comparison=comparison,
         started_at=f"{started_at:%Y-%m-%d %H:%M:%S}" if started_at else None,
-        totals=_totals(report),
+        totals=_totals(report, overview.unreadable),
         steps=_steps(report),
         writer_s=report.summary.steps.write,
-        slowest=_slowest(report) if several else [],
-        recordings=_list_recordings(report, None if list_link else folder or Path()),
+        slowest=_slowest(report, overview.durations),
+        recordings=_list_recordings(report, overview.ranks, None if list_link else folder or Path()),
     )
 
 
@@ -81,34 +89,12 @@ class Verdict(Struct, frozen=True):
     text: str
 
 
-def verdict_of(recordings: Sequence[Report]) -> Verdict:
+def verdict_of(recordings: Iterable[Report]) -> Verdict:
     """Return the gravest outcome of the recordings, with their numbers."""
-    if not recordings:
-        return Verdict("none", "No recording was ingested", "The job selected no recording.")
-    failed = sum(one.status in FAILED for one in recordings)
-    violations = sum(one.contract is not None and not one.contract.passed for one in recordings)
-    incomplete = sum(one.status is RunStatus.WITH_ERRORS for one in recordings)
-    skipped = sum(one.status is RunStatus.SKIPPED for one in recordings)
-    counts = {
-        "failed": failed,
-        "with a violated contract": violations,
-        "stored without some messages": incomplete,
-        "already stored before": skipped,
-    }
-    parts = [f"{count_text(count)} {words}" for words, count in counts.items() if count]
-    message_text = counted(sum(one.totals.written for one in recordings), "message")
-    text = f"{counted(len(recordings), 'recording')}{': ' if parts else ''}{', '.join(parts)}; {message_text} written"
-    if failed:
-        title = "The run failed" if failed == len(recordings) else "The run failed for some recordings"
-        return Verdict("bad", title, text)
-    if violations:
-        is_tolerated = all(one.contract is None or one.contract.on_failure == "warn" for one in recordings)
-        return Verdict("warn" if is_tolerated else "bad", "The data violate the contract", text)
-    if incomplete:
-        return Verdict("warn", "Some messages are missing", text)
-    if skipped == len(recordings):
-        return Verdict("none", "Everything was already stored", text)
-    return Verdict("good", "Everything was stored", text)
+    counts = _VerdictCounts()
+    for recording in recordings:
+        counts.add(recording)
+    return counts.verdict()
 
 
 class RecordingLink(Struct, frozen=True):
@@ -133,21 +119,7 @@ class Problem(Struct, frozen=True):
     """Number of affected recordings."""
 
 
-def run_problems(report: RunReport) -> list[Problem]:
-    """Return the problems: failed recordings and violated contracts first, then by number of recordings."""
-    groups: dict[tuple[str, ...], list[_Entry]] = {}
-    for at, recording in enumerate(report.recordings):
-        for entry in (
-            *_failures(at, recording),
-            *_violations(at, recording),
-            *_missing(at, recording, report),
-        ):
-            groups.setdefault(entry.key, []).append(entry)
-    problems = [_problem(entries, report.recordings) for entries in groups.values()]
-    return sorted(problems, key=lambda problem: (not problem.is_error, -problem.count))
-
-
-def _totals(report: RunReport) -> dict[str, str]:
+def _totals(report: RunReport, unreadable: str) -> dict[str, str]:
     summary = report.summary
     source_bytes, stored_bytes = summary.source_bytes, summary.stored_bytes
     seconds, message_count = summary.duration_s, summary.read
@@ -157,7 +129,7 @@ def _totals(report: RunReport) -> dict[str, str]:
         "Messages read": count_text(message_count),
         "Written": count_text(summary.written),
         "Rejected": count_text(summary.rejected),
-        "Unreadable": unreadable_text(report.recordings),
+        "Unreadable": unreadable,
         "Recorded": bytes_text(source_bytes),
         "Stored": f"{bytes_text(stored_bytes)}{share}",
         "Working time": seconds_text(seconds),
@@ -169,8 +141,85 @@ def _steps(report: RunReport) -> list[StepShare]:
     return step_shares(step_seconds(report.summary.steps), stacked=False)
 
 
-def _slowest(report: RunReport) -> list[RecordingView]:
-    return [RecordingView(at, report, Path()) for at, _ in slowest(report.recordings, MAX_SLOWEST)]
+def _slowest(report: RunReport, durations: array[float]) -> list[RecordingView]:
+    """Return the recordings with the longest duration if there are several; untimed recordings are excluded."""
+    if len(durations) == 1:
+        return []
+    timed = (at for at, duration in enumerate(durations) if duration >= 0)
+    longest = nlargest(MAX_SLOWEST, timed, key=lambda at: durations[at])
+    return [RecordingView(at, report, Path()) for at in longest]
+
+
+class _VerdictCounts:
+    """The numbers of recordings by outcome."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._is_tolerated = True
+        """Whether every violated contract only warns."""
+
+    def add(self, recording: Report) -> None:
+        """Count a recording."""
+        contract = recording.contract
+        self._counts["recordings"] += 1
+        self._counts["failed"] += recording.status in FAILED
+        self._counts["violations"] += contract is not None and not contract.passed
+        self._counts["incomplete"] += recording.status is RunStatus.WITH_ERRORS
+        self._counts["skipped"] += recording.status is RunStatus.SKIPPED
+        self._counts["written"] += recording.totals.written
+        self._is_tolerated &= contract is None or contract.on_failure == "warn"
+
+    def verdict(self) -> Verdict:
+        """Return the gravest outcome."""
+        counts = self._counts
+        if not counts["recordings"]:
+            return Verdict("none", "No recording was ingested", "The job selected no recording.")
+        words = {
+            "failed": "failed",
+            "violations": "with a violated contract",
+            "incomplete": "stored without some messages",
+            "skipped": "already stored before",
+        }
+        parts = [f"{count_text(counts[name])} {text}" for name, text in words.items() if counts[name]]
+        recordings = f"{counted(counts['recordings'], 'recording')}{': ' if parts else ''}{', '.join(parts)}"
+        text = f"{recordings}; {counted(counts['written'], 'message')} written"
+        if counts["failed"]:
+            is_complete = counts["failed"] == counts["recordings"]
+            return Verdict(
+                "bad", "The run failed" if is_complete else "The run failed for some recordings", text
+            )
+        if counts["violations"]:
+            return Verdict("warn" if self._is_tolerated else "bad", "The data violate the contract", text)
+        if counts["incomplete"]:
+            return Verdict("warn", "Some messages are missing", text)
+        if counts["skipped"] == counts["recordings"]:
+            return Verdict("none", "Everything was already stored", text)
+        return Verdict("good", "Everything was stored", text)
+
+
+class _Overview:
+    """The values of the page that depend on all recordings, which are read once."""
+
+    def __init__(self, report: RunReport) -> None:
+        self.verdict = _VerdictCounts()
+        self.contracts = ContractSummaries()
+        self.problems = _Problems(report)
+        self.ranks = bytearray()
+        self.durations = array("d")
+        """Seconds of each recording; -1 if its steps were not timed."""
+        unreadable: int = 0
+        is_known = True
+        for at, recording in enumerate(report.recordings):
+            self.verdict.add(recording)
+            self.contracts.add(at, recording)
+            self.problems.add(at, recording)
+            self.ranks.append(problem_rank(recording))
+            is_timed = any(step_seconds(recording.steps).values())
+            self.durations.append(recording.duration_s if is_timed else -1)
+            for item in recording.unreadable_ranges:
+                unreadable += item.count or 0
+                is_known &= item.count is not None
+        self.unreadable = count_text(unreadable) if is_known else at_least_text(unreadable)
 
 
 class _List(Struct, frozen=True):
@@ -182,26 +231,29 @@ class _List(Struct, frozen=True):
     """All elements of the list; None if `items` has them all."""
     contents: Mapping[str, Markup]
     """The contents of elements that are not in them, by id of the pack."""
+    ids: Collection[str]
+    """The ids of the elements."""
 
 
-def _list_recordings(report: RunReport, folder: Path | None) -> _List:
+def _list_recordings(report: RunReport, ranks: bytearray, folder: Path | None) -> _List:
     """Return the list with problems first. Contents are rendered together and compressed, beyond the first ones."""
-    views = [RecordingView(at, report, folder) for at in range(len(report.recordings))]
-    views.sort(key=lambda view: -view.rank)
-    readable = len(views) if len(views) <= MAX_ROWS else MAX_OPEN
+    order = sorted(range(len(ranks)), key=lambda at: -ranks[at])[:MAX_LISTED]
+    readable = len(order) if len(order) <= MAX_ROWS else MAX_OPEN
     items: list[Markup] = []
-    for at, view in enumerate(views[:readable]):
-        is_open = len(views) == 1 or (view.rank > 0 and at < MAX_OPEN)
+    for number, at in enumerate(order[:readable]):
+        view = RecordingView(at, report, folder)
+        is_open = len(order) == 1 or (view.rank > 0 and number < MAX_OPEN)
         items.append(macro("recording.html", "item", view, is_open))
     contents: dict[str, Markup] = {}
-    for start in range(readable, len(views), PACK_SIZE):
-        part = views[start : start + PACK_SIZE]
+    for start in range(readable, len(order), PACK_SIZE):
+        part = [RecordingView(at, report, folder) for at in order[start : start + PACK_SIZE]]
         name = f"pack-{len(contents)}"
         contents[name] = pack([macro("recording.html", "content", view) for view in part])
         items += [macro("recording.html", "packed_item", view, name, at) for at, view in enumerate(part)]
+    ids = {f"r{at}" for at in order}
     if len(items) <= MAX_ROWS:
-        return _List(items, None, contents)
-    return _List(items[:MAX_ROWS], pack(items), contents)
+        return _List(items, None, contents, ids)
+    return _List(items[:MAX_ROWS], pack(items), contents, ids)
 
 
 class _Entry(Struct, frozen=True):
@@ -218,20 +270,65 @@ class _Entry(Struct, frozen=True):
     is_error: bool = False
 
 
-def _problem(entries: Sequence[_Entry], recordings: Sequence[Report]) -> Problem:
-    first = entries[0]
-    positions = list(dict.fromkeys(entry.at for entry in entries))
-    commands = dict.fromkeys(entry.command for entry in entries if entry.command)
-    links = tuple(RecordingLink(f"r{at}", recordings[at].sequence) for at in positions[:MAX_LINKS])
-    return Problem(
-        is_error=first.is_error,
-        title=first.title(sum(entry.messages for entry in entries)),
-        reason=first.reason,
-        advice=first.advice,
-        command=next(iter(commands), None),
-        recordings=links,
-        count=len(positions),
-    )
+class _Group:
+    """The occurrences of a problem in all recordings."""
+
+    def __init__(self, first: _Entry) -> None:
+        self._first = first
+        self._last = -1
+        self._count = self._messages = 0
+        self._links: list[RecordingLink] = []
+        self._command: str | None = None
+
+    def add(self, entry: _Entry, sequence: str) -> None:
+        """Add an occurrence."""
+        self._messages += entry.messages
+        self._command = self._command or entry.command
+        if entry.at != self._last:
+            self._last = entry.at
+            self._count += 1
+            if len(self._links) < MAX_LINKS:
+                self._links.append(RecordingLink(f"r{entry.at}", sequence))
+
+    def problem(self) -> Problem:
+        """Return the problem."""
+        first = self._first
+        return Problem(
+            is_error=first.is_error,
+            title=first.title(self._messages),
+            reason=first.reason,
+            advice=first.advice,
+            command=self._command,
+            recordings=tuple(self._links),
+            count=self._count,
+        )
+
+
+class _Problems:
+    """The problems of a run, at most `MAX_PROBLEMS` different ones."""
+
+    def __init__(self, run: RunReport) -> None:
+        self._run = run
+        self._groups: dict[tuple[str, ...], _Group] = {}
+
+    def add(self, at: int, recording: Report) -> None:
+        """Add the problems of a recording."""
+        for entry in (
+            *_failures(at, recording),
+            *_violations(at, recording),
+            *_missing(at, recording, self._run),
+        ):
+            group = self._groups.get(entry.key)
+            if group is None:
+                if len(self._groups) >= MAX_PROBLEMS:
+                    continue
+                group = self._groups[entry.key] = _Group(entry)
+            group.add(entry, recording.sequence)
+
+    def problems(self) -> list[Problem]:
+        """Return failed recordings and violated contracts first, then by number of recordings."""
+        problems = [group.problem() for group in self._groups.values()]
+        return sorted(problems, key=lambda problem: (not problem.is_error, -problem.count))
 
 
 def _failures(at: int, report: Report) -> Iterator[_Entry]:

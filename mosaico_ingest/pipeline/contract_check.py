@@ -13,6 +13,7 @@ from mosaico_ingest.contracts.monitor import RecordingMonitor
 from mosaico_ingest.errors import IngestError, ManifestError
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.job.values import Unmodeled
+from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.pipeline.task import Task, open_job
 from mosaico_ingest.report.parts import ContractResult, ExpectationResult
 from mosaico_ingest.rosbag.blocks import Int64s
@@ -109,6 +110,10 @@ def add_group_results(tasks: Sequence[Task], present: Callable[[], Sequence[Job]
 
 def results_by_job(jobs: Sequence[Job]) -> dict[int, tuple[ExpectationResult, ...]]:
     """Return the results of the group of each job, by position, for the jobs that have expectations of their group."""
+    if not any(
+        job.expect is not None and job.expect.group is not None for job in LazySequence.of(jobs).samples
+    ):
+        return {}
     groups: dict[tuple[object, ...], list[int]] = defaultdict(list)
     for position, job in enumerate(jobs):
         if job.expect is not None and job.expect.group is not None:

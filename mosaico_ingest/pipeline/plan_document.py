@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from array import array
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, TypeAlias, TypeVar
 
 from msgspec import Struct
-from pydantic import Field, GetJsonSchemaHandler
+from pydantic import AfterValidator, Field, GetJsonSchemaHandler, ValidationError
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
 from mosaico_ingest.display import count_text
-from mosaico_ingest.documents import Part, html_table, read_document, read_limited
-from mosaico_ingest.errors import ManifestError
+from mosaico_ingest.documents import (
+    JsonListWriter,
+    LineFile,
+    Part,
+    html_table,
+    read_document,
+    read_limited,
+)
+from mosaico_ingest.errors import ManifestError, gravest
 from mosaico_ingest.findings import Finding, Severity, Stage
+from mosaico_ingest.lazy import LazySequence
 from mosaico_ingest.pipeline.plan import Plan, plan_headline
 from mosaico_ingest.report.parts import ContractResult
 
@@ -24,6 +33,12 @@ _NAMES = {"topics": ("topic", "target"), "excluded": ("excluded topic", "topic")
 """For each list of a plan, the name of its items and the key that identifies an item."""
 PlanJson: TypeAlias = Mapping[str, Any]
 """A serialized plan, see `Plan.document`."""
+MAX_ADDED = 1000
+"""Plans of new sequences that are compared with plans of the same files under another name."""
+LINES_SUFFIX = ".jsonl"
+"""The suffix of plan files in JSON Lines."""
+_HINT = "create a plan with `ingest plan job.yaml --out plan.json`"
+_Model = TypeVar("_Model", bound=Part)
 _Change: TypeAlias = "tuple[str, str | None, str | None]"
 """Key path, text before, text after."""
 
@@ -120,6 +135,21 @@ class RecordingPlan(Part):
         return not has_latched and all(sample.count == 0 for sample in self.samples)
 
     @property
+    def exit_code(self) -> int:
+        """The exit code of the recording's plan.
+
+        1 if the destination refuses, 6 if the data contract is violated and `expect.on_failure` is not `warn`, 3 if the
+        recording has no message, 4 if sampled messages would be rejected, else 0.
+        """
+        if self.destination.problem:
+            return 1
+        if self.violates_contract:
+            return 6
+        if self.is_empty:
+            return 3
+        return 4 if self.rejected else 0
+
+    @property
     def count_texts(self) -> dict[str, str]:
         """The number of messages by the topic's name in the sequence, such as `2,110`, `600 of 2,110` or `?`."""
         samples = {sample.target: sample.count for sample in self.samples}
@@ -131,6 +161,14 @@ class RecordingPlan(Part):
         return texts
 
 
+class _Header(Part):
+    """The first line of a plan in JSON Lines."""
+
+    version: Literal[1] = 1
+    tool: str
+    job: str
+
+
 class PlanDocument(Part):
     """The plans of all recordings of a manifest; `version` changes with the format."""
 
@@ -139,7 +177,7 @@ class PlanDocument(Part):
     """Name and version of the program that wrote the document."""
     job: str = Field(examples=["job.yaml"])
     """The manifest, relative to this file's folder."""
-    recordings: tuple[RecordingPlan, ...]
+    recordings: Annotated[Sequence[RecordingPlan], AfterValidator(tuple)]
 
     def __repr__(self) -> str:
         """Return the counts of each plan, one line per recording."""
@@ -178,32 +216,77 @@ class PlanDocument(Part):
 
     @property
     def exit_code(self) -> int:
-        """The exit code of the plan.
+        """The first of 1, 6, 3, 4, 0 that any recording has."""
+        return gravest({recording.exit_code for recording in self.recordings})
 
-        1 if a destination refuses, 6 if a data contract is violated and `expect.on_failure` is not `warn`, 3 if a recording
-        has no message, 4 if sampled messages would be rejected, else 0.
-        """
-        if any(recording.destination.problem for recording in self.recordings):
-            return 1
-        if any(recording.violates_contract for recording in self.recordings):
-            return 6
-        if any(recording.is_empty for recording in self.recordings):
-            return 3
-        return 4 if any(recording.rejected for recording in self.recordings) else 0
+
+class PlanWriter:
+    """Writes a plan document recording by recording: as JSON, or as JSON Lines with a header."""
+
+    def __init__(self, write: Callable[[str], object], frame: PlanDocument, *, lines: bool = False) -> None:
+        self._write, self._header = write, _Header(tool=frame.tool, job=frame.job) if lines else None
+        self._list = JsonListWriter(write, frame.model_dump_json(indent=2))
+
+    @property
+    def has_items(self) -> bool:
+        """Whether a recording was written."""
+        return self._list.has_items
+
+    def add(self, recording: RecordingPlan) -> None:
+        """Write the plan of a recording."""
+        if self._header is None:
+            self._list.add(recording.model_dump_json(indent=2))
+            return
+        if not self._list.has_items:
+            self._write(self._header.model_dump_json() + "\n")
+            self._list.has_items = True
+        self._write(recording.model_dump_json() + "\n")
+
+    def finish(self) -> None:
+        """Write the end of the document."""
+        if self._header is None:
+            self._list.finish()
 
 
 def read_plan(path: Path) -> PlanDocument:
-    """Read a plan file.
+    """Read a plan file; the recordings of a file in JSON Lines are read at each access.
 
     Raises:
         ManifestError: The file cannot be read or violates the schema of plans.
     """
-    hint = "create a plan with `ingest plan job.yaml --out plan.json`"
     try:
+        if path.suffix == LINES_SUFFIX:
+            return _read_lines(path)
         content = read_limited(path)
     except OSError as error:
-        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=hint) from error
-    return read_document(content, PlanDocument, where=str(path), kind="a plan", hint=hint)
+        raise ManifestError(f"cannot be read: {error.strerror}", where=str(path), hint=_HINT) from error
+    return read_document(content, PlanDocument, where=str(path), kind="a plan", hint=_HINT)
+
+
+def _read_lines(path: Path) -> PlanDocument:
+    """Return the plan document in JSON Lines; only the offsets of its lines are kept."""
+    offsets = array("q")
+    with path.open("rb") as file:
+        header = _parse_line(path, 0, file.readline(), _Header)
+        offset = file.tell()
+        for line in file:
+            offsets.append(offset)
+            offset += len(line)
+    lines = LineFile(path)
+
+    def recording(position: int) -> RecordingPlan:
+        offset = offsets[position]
+        return _parse_line(path, offset, lines.read(offset), RecordingPlan)
+
+    recordings = LazySequence(recording, range(len(offsets)), ())
+    return PlanDocument.model_construct(tool=header.tool, job=header.job, recordings=recordings)
+
+
+def _parse_line(path: Path, offset: int, line: bytes, model: type[_Model]) -> _Model:
+    try:
+        return model.model_validate_json(line)
+    except ValidationError:
+        return read_document(line, model, where=f"{path}: byte {offset}", kind="a plan", hint=_HINT)
 
 
 def _count_text(count: int | None) -> str:
@@ -242,37 +325,51 @@ class Difference(Struct, frozen=True):
         return f"{self.sequence}: {self.name}: {self.before} → {self.after}"
 
 
-def differences(before: Sequence[PlanJson], after: Sequence[PlanJson]) -> tuple[Difference, ...]:
-    """Return the differences between the plans of two documents.
+class PlanComparison:
+    """Compares plans one by one with the plans of another document.
 
     Plans are compared with each other if they have the same sequence name, or else the same files.
     """
-    return tuple(
-        difference
-        for old, new in _pairs(before, after)
-        for difference in (_compare(old, new) if old and new else [_one_side(old, new)])
-    )
+
+    def __init__(self, before: Sequence[PlanJson]) -> None:
+        self._before = before
+        self._positions: dict[str, list[int]] = {}
+        for position, plan in enumerate(before):
+            self._positions.setdefault(_sequence(plan), []).append(position)
+        self._added: list[PlanJson] = []
+        """At most `MAX_ADDED` plans without an earlier plan of the same name."""
+
+    def add(self, plan: PlanJson) -> list[Difference]:
+        """Return the differences of a plan from the earlier plan of its sequence, if there is one."""
+        positions = self._positions.get(_sequence(plan))
+        if positions:
+            return list(_compare(self._before[positions.pop(0)], plan))
+        if len(self._added) >= MAX_ADDED:
+            return [_one_side(None, plan)]
+        self._added.append(plan)
+        return []
+
+    def finish(self) -> Iterator[Difference]:
+        """Yield the differences of the plans whose sequences are in one of the documents only."""
+        missing = sorted(position for positions in self._positions.values() for position in positions)
+        for position in missing:
+            old = self._before[position]
+            same = [plan for plan in self._added if plan["files"] == old["files"]]
+            is_only_pair = len(self._added) == len(missing) == 1
+            new = same[0] if same else self._added[0] if is_only_pair else None
+            if new is None:
+                yield _one_side(old, None)
+            else:
+                self._added.remove(new)
+                yield from _compare(old, new)
+        yield from (_one_side(None, plan) for plan in self._added)
 
 
-def _pairs(
-    before: Sequence[PlanJson], after: Sequence[PlanJson]
-) -> Iterator[tuple[PlanJson | None, PlanJson | None]]:
-    candidates = list(after)
-    unpaired: list[PlanJson] = []
-    for old in before:
-        new = next((plan for plan in candidates if _sequence(plan) == _sequence(old)), None)
-        if new is None:
-            unpaired.append(old)
-            continue
-        candidates.remove(new)
-        yield old, new
-    for old in unpaired:
-        same = [plan for plan in candidates if plan["files"] == old["files"]]
-        new = same[0] if same else candidates[0] if len(candidates) == len(unpaired) == 1 else None
-        if new is not None:
-            candidates.remove(new)
-        yield old, new
-    yield from ((None, new) for new in candidates)
+def differences(before: Sequence[PlanJson], after: Iterable[PlanJson]) -> tuple[Difference, ...]:
+    """Return the differences between the plans of two documents; see `PlanComparison`."""
+    comparison = PlanComparison(before)
+    changes = [difference for plan in after for difference in comparison.add(plan)]
+    return (*changes, *comparison.finish())
 
 
 def _sequence(plan: PlanJson) -> str:

@@ -21,6 +21,7 @@ from mosaico_ingest.destinations.base import (
     destination_of,
 )
 from mosaico_ingest.destinations.memory import MemorySink
+from mosaico_ingest.display import counted
 from mosaico_ingest.errors import IngestError, SinkError
 from mosaico_ingest.findings import Finding, Severity
 from mosaico_ingest.job.model import Job
@@ -55,6 +56,8 @@ _MEMORY_BYTES = 32 << 20
 _SAMPLE_BYTES, _REMOTE_SAMPLE_BYTES = 64 << 20, 4 << 20
 """Bytes read to find the messages of the sample; topics that are still missing are then read by the index."""
 _SAMPLE_S = 5.0
+MAX_FINDINGS = 1000
+"""Findings that the error about recordings that cannot be planned contains."""
 
 
 def ask_destination(plan: Plan, samples: Iterable[Sample], *, connect: bool) -> DestinationState:
@@ -244,51 +247,66 @@ def _sample_blocks(
             return
 
 
-def plan_document(jobs: Sequence[Job], *, manifest: Path, folder: Path, connect: bool) -> PlanDocument:
-    """Return the plan document of a manifest's jobs, with paths relative to `folder`.
+def plan_recordings(jobs: Sequence[Job], *, connect: bool) -> Iterator[RecordingPlan]:
+    """Yield the plan of each recording as soon as it is made; a recording that cannot be planned does not stop the others.
 
     Raises:
-        IngestError: A job cannot be done; `findings` states the reason for each of them.
+        IngestError: Jobs cannot be done; raised after the last plan. `findings` has the reasons of the first ones.
     """
     groups = results_by_job(jobs)
-    outcomes = [
-        _plan_or_error(job, connect=connect, group=groups.get(position, ()))
-        for position, job in enumerate(jobs)
-    ]
-    errors = [outcome for outcome in outcomes if isinstance(outcome, IngestError)]
-    if errors:
-        raise errors[0] if len(outcomes) == 1 else _all_of(errors, len(outcomes))
-    return PlanDocument(
-        tool=f"mosaico-ingest {__version__}",
-        job=Path(relpath(manifest, folder)).as_posix(),
-        recordings=tuple(outcome for outcome in outcomes if isinstance(outcome, RecordingPlan)),
-    )
+    failures = _Failures()
+    for position, job in enumerate(jobs):
+        try:
+            plan = preview(job, connect=connect, group=groups.get(position, ()))
+        except IngestError as error:  # noqa: PERF203 - the other recordings are planned nevertheless
+            failures.add(error)
+        else:
+            yield plan
+    failures.raise_if_any(len(jobs))
 
 
-def _plan_or_error(
-    job: Job, *, connect: bool, group: tuple[ExpectationResult, ...]
-) -> RecordingPlan | IngestError:
-    try:
-        return preview(job, connect=connect, group=group)
-    except IngestError as error:
-        return error
+def plan_frame(manifest: Path, folder: Path) -> PlanDocument:
+    """Return the plan document of a manifest without recordings, with paths relative to `folder`."""
+    job = Path(relpath(manifest, folder)).as_posix()
+    return PlanDocument(tool=f"mosaico-ingest {__version__}", job=job, recordings=())
 
 
-def _all_of(errors: Sequence[IngestError], count: int) -> IngestError:
-    """Return one error for several recordings, with the lowest exit code."""
-    findings = [
-        finding
-        for error in errors
-        for finding in error.findings or (Finding("plan-failed", Severity.ERROR, str(error)),)
-    ]
-    error = min(errors, key=lambda error: error.exit_code)
-    error.what, error.where, error.hint = (
-        f"{len(errors)} of {count} recordings cannot be ingested",
-        None,
-        None,
-    )
-    error.findings = tuple(dict.fromkeys(findings))
-    return error
+class _Failures:
+    """The errors of recordings that cannot be planned."""
+
+    def __init__(self) -> None:
+        self._gravest: IngestError | None = None
+        """The first error with the lowest exit code."""
+        self._count = 0
+        self._findings: dict[Finding, None] = {}
+        self._more = 0
+
+    def add(self, error: IngestError) -> None:
+        """Add the error of a recording."""
+        self._count += 1
+        if self._gravest is None or error.exit_code < self._gravest.exit_code:
+            self._gravest = error
+        for finding in error.findings or (Finding("plan-failed", Severity.ERROR, str(error)),):
+            if len(self._findings) < MAX_FINDINGS:
+                self._findings[finding] = None
+            else:
+                self._more += finding not in self._findings
+
+    def raise_if_any(self, recordings: int) -> None:
+        """Raise one error for all of them; with one recording, its own."""
+        error = self._gravest
+        if error is None:
+            return
+        if recordings > 1:
+            error.what, error.where = f"{self._count} of {recordings} recordings cannot be ingested", None
+            error.hint = None
+            findings = list(self._findings)
+            if self._more:
+                findings.append(
+                    Finding("plan-failed", Severity.ERROR, f"{counted(self._more, 'more finding')}")
+                )
+            error.findings = tuple(findings)
+        raise error
 
 
 def preview(job: Job, *, connect: bool, group: tuple[ExpectationResult, ...] = ()) -> RecordingPlan:

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from datetime import datetime
+from heapq import nlargest
 from pathlib import Path
 from urllib.parse import quote
 
@@ -306,13 +307,16 @@ class Report(ReportPart):
         return round(self.totals.stored_bytes / self.source_bytes, 6) if self.source_bytes else None
 
 
-def unreadable_text(reports: Iterable[Report]) -> str:
+def unreadable_text(report: Report) -> str:
     """Return the number of unreadable messages, such as `12`, `at least 12` or `unknown`."""
-    counts = [item.count for report in reports for item in report.unreadable_ranges]
+    counts = [item.count for item in report.unreadable_ranges]
     total = sum(count or 0 for count in counts)
-    if None not in counts:
-        return count_text(total)
-    return f"at least {count_text(total)}" if total else "unknown"
+    return at_least_text(total) if None in counts else count_text(total)
+
+
+def at_least_text(count: int) -> str:
+    """Return a number to which an unknown one is added, such as `at least 12` or `unknown`."""
+    return f"at least {count_text(count)}" if count else "unknown"
 
 
 def topic_table(report: Report) -> str:
@@ -358,8 +362,8 @@ def longest_step(steps: Steps) -> str:
 
 def slowest(recordings: Sequence[Report], most: int) -> list[tuple[int, Report]]:
     """Return the recordings with the longest duration, with their positions; untimed recordings are excluded."""
-    timed = [(at, one) for at, one in enumerate(recordings) if any(step_seconds(one.steps).values())]
-    return sorted(timed, key=lambda found: -found[1].duration_s)[:most]
+    timed = ((at, one) for at, one in enumerate(recordings) if any(step_seconds(one.steps).values()))
+    return nlargest(most, timed, key=lambda one: one[1].duration_s)
 
 
 class Collector:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 from msgspec import Struct
 from msgspec.structs import replace
@@ -122,9 +122,33 @@ def prometheus_text(report: RunReport) -> str:
     return "\n".join(_gauges(report)) + "\n"
 
 
-def contract_metrics(contracts: Sequence[ContractResult]) -> str:
-    """Return the number of contracts and expectations by outcome as gauges."""
-    return "".join(f"{line}\n" for line in _contract_gauges(contracts))
+class ContractCounts:
+    """The numbers of contracts and expectations by outcome."""
+
+    def __init__(self) -> None:
+        self._outcomes: Counter[bool] = Counter()
+        self._counts: Counter[tuple[Outcome, Severity]] = Counter()
+
+    def add(self, contract: ContractResult) -> None:
+        """Count the results of a contract."""
+        self._outcomes[contract.passed] += 1
+        self._counts.update((result.outcome, result.severity) for result in contract.results)
+
+    def gauges(self) -> str:
+        """Return the numbers as gauges for Prometheus; empty without a contract."""
+        return "".join(f"{line}\n" for line in self._lines())
+
+    def _lines(self) -> Iterator[str]:
+        if not self._outcomes:
+            return
+        yield from _gauge("contracts", "Recordings of the last run by the outcome of their data contracts.")
+        for outcome, passed in ((Outcome.PASSED, True), (Outcome.FAILED, False)):
+            yield f'{_PREFIX}_contracts{{outcome="{outcome.value}"}} {self._outcomes[passed]}'
+        yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
+        for outcome in Outcome:
+            for severity in (Severity.ERROR, Severity.WARNING):
+                labels = f'outcome="{outcome.value}",severity="{severity.value}"'
+                yield f"{_PREFIX}_expectations{{{labels}}} {self._counts[outcome, severity]}"
 
 
 class _Sum(Struct):
@@ -303,25 +327,6 @@ def _escape(text: str) -> str:
     return one_line(" ".join(text.split()))
 
 
-def _contract_gauges(contracts: Iterable[ContractResult]) -> Iterator[str]:
-    """Yield the numbers of contracts and expectations; nothing without a contract."""
-    outcomes: Counter[bool] = Counter()
-    counts: Counter[tuple[Outcome, Severity]] = Counter()
-    for contract in contracts:
-        outcomes[contract.passed] += 1
-        counts.update((result.outcome, result.severity) for result in contract.results)
-    if not outcomes:
-        return
-    yield from _gauge("contracts", "Recordings of the last run by the outcome of their data contracts.")
-    for outcome, passed in ((Outcome.PASSED, True), (Outcome.FAILED, False)):
-        yield f'{_PREFIX}_contracts{{outcome="{outcome.value}"}} {outcomes[passed]}'
-    yield from _gauge("expectations", "Expectations of the last run by outcome and severity.")
-    for outcome in Outcome:
-        for severity in (Severity.ERROR, Severity.WARNING):
-            labels = f'outcome="{outcome.value}",severity="{severity.value}"'
-            yield f"{_PREFIX}_expectations{{{labels}}} {counts[outcome, severity]}"
-
-
 def _gauges(report: RunReport) -> Iterator[str]:
     summary = report.summary
     yield from _gauge("recordings", "Recordings of the last run by status.")
@@ -330,7 +335,11 @@ def _gauges(report: RunReport) -> Iterator[str]:
     yield from _gauge("messages", "Messages of the last run by outcome.")
     for fate in ("read", "written", "filtered", "downsampled", "rejected", "unreadable"):
         yield f'{_PREFIX}_messages{{fate="{fate}"}} {getattr(summary, fate)}'
-    yield from _contract_gauges(one.contract for one in report.recordings if one.contract is not None)
+    contracts = ContractCounts()
+    for one in report.recordings:
+        if one.contract is not None:
+            contracts.add(one.contract)
+    yield from contracts.gauges().splitlines()
     yield from _gauge(
         "step_seconds", "Time of the last run by step; the write step runs in parallel to the others."
     )

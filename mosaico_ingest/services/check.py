@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -41,9 +41,8 @@ class Checked(Struct, frozen=True):
         return 0 if self.contract is None or self.contract.passed else ContractError.exit_code
 
 
-def check_jobs(jobs: Iterable[Job]) -> Iterator[Checked]:
+def check_jobs(jobs: Sequence[Job]) -> Iterator[Checked]:
     """Yield the results of each recording; an unreadable recording does not stop the others."""
-    jobs = tuple(jobs)
     groups = results_by_job(jobs)
     for position, job in enumerate(jobs):
         yield _checked(job, groups.get(position, ()))

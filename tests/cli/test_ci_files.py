@@ -10,7 +10,7 @@ import pytest
 from metadata_files import write
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.cli.check import CheckedRecording, write_ci_files
+from mosaico_ingest.cli.check import CheckedRecording, CiFiles
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Location, Outcome
 
@@ -60,7 +60,8 @@ def cases(path: Path) -> list[tuple[str, str, str | None, str | None]]:
 
 
 def test_junit_has_a_test_case_per_expectation_with_location_of_its_key(tmp_path: Path) -> None:
-    write_ci_files([CheckedRecording("drive", CONTRACT)], junit=tmp_path / "a.xml", sarif=None)
+    with CiFiles(tmp_path / "a.xml", None) as files:
+        files.add(CheckedRecording("drive", CONTRACT))
     assert cases(tmp_path / "a.xml") == [
         ("expect.topics./imu.rate", "passed", "job.yaml", "7"),
         ("expect.topics./imu.gap", "failure", "job.yaml", "7"),
@@ -73,7 +74,8 @@ def test_junit_has_a_test_case_per_expectation_with_location_of_its_key(tmp_path
 
 
 def test_sarif_has_a_result_per_failed_expectation_at_its_key(tmp_path: Path) -> None:
-    write_ci_files([CheckedRecording("drive", CONTRACT)], junit=None, sarif=tmp_path / "a.sarif")
+    with CiFiles(None, tmp_path / "a.sarif") as files:
+        files.add(CheckedRecording("drive", CONTRACT))
     [run] = json.loads((tmp_path / "a.sarif").read_text())["runs"]
     assert [(one["ruleId"], one["level"]) for one in run["results"]] == [
         ("expectation-failed", "error"),

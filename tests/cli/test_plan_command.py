@@ -334,7 +334,9 @@ def test_plan_several_unusable_recordings_reports_each(ingest: Ingest) -> None:
     Path("a.mcap").unlink()
     code, output = ingest("plan", "job.yaml", "--json")
     assert code == 3
-    assert output.startswith("error[plan-failed] c.bag: ")
+    document, _, error = output.partition("error[plan-failed] c.bag: ")
+    assert error
+    assert [one["plan"]["sequence"]["name"] for one in json.loads(document)["recordings"]] == ["b"]
 
 
 def test_plan_topics_without_messages_exits_3(ingest: Ingest) -> None:

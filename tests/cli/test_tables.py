@@ -62,7 +62,9 @@ def test_print_inspection_narrow_terminal_keeps_numbers(capsys: pytest.CaptureFi
 
 @pytest.mark.usefixtures("narrow")
 def test_print_plan_narrow_terminal_keeps_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    plan_command.print_plan(api.plan_job(JOB), folder=JOB.parent)
+    tables = plan_command.PlanTables(JOB.parent)
+    for recording in api.plan_job(JOB).recordings:
+        tables.add(recording)
     assert {"1,000", "messages:"} <= words(capsys)
 
 

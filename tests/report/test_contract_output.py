@@ -9,7 +9,7 @@ from mosaico_ingest.report.events import RunStatus
 from mosaico_ingest.report.parts import ContractResult, ExpectationResult, Location, Outcome
 from mosaico_ingest.report.recording import Report
 from mosaico_ingest.report.run import RunReport
-from mosaico_ingest.report.summaries import contract_metrics, markdown_summary, prometheus_text
+from mosaico_ingest.report.summaries import ContractCounts, markdown_summary, prometheus_text
 
 LOCATION = Location(file="job.yaml", line=7, column=5, end_line=7, end_column=9)
 
@@ -79,7 +79,7 @@ def test_metrics_count_contracts_by_outcome() -> None:
     lines = prometheus_text(MIXED).splitlines()
     assert 'mosaico_ingest_contracts{outcome="passed"} 0' in lines
     assert 'mosaico_ingest_contracts{outcome="failed"} 1' in lines
-    assert contract_metrics([]) == ""
+    assert ContractCounts().gauges() == ""
 
 
 def test_metrics_without_contract_have_no_expectations() -> None:
