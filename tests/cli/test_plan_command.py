@@ -373,3 +373,21 @@ def test_expand_literal_secret_is_masked(ingest: Ingest) -> None:
         assert code == 0
         assert "s3cretkey" not in output
         assert "***" in output
+
+
+def test_plan_lines_are_checked_and_run_like_a_json_plan(ingest: Ingest) -> None:
+    for name in ("a", "b"):
+        shutil.copy("configs/quickstart/drive.mcap", f"{name}.mcap")
+    manifest = (
+        'bag: {path: "[ab].mcap"}\nsequence: {name: "{stem}"}\ntopics: [/imu]\ntarget: {store: lines}\n'
+    )
+    Path("job.yaml").write_text(manifest)
+    assert ingest("plan", "job.yaml", "--out", "plan.jsonl")[0] == 0
+    assert ingest("plan", "job.yaml", "--out", "plan.json")[0] == 0
+    _, *lines = Path("plan.jsonl").read_text().splitlines()
+    planned = json.loads(Path("plan.json").read_text())["recordings"]
+    assert [json.loads(line)["plan"] for line in lines] == [one["plan"] for one in planned]
+    assert ingest("plan", "job.yaml", "--check", "plan.jsonl") == (0, "the plans are equal\n")
+    assert ingest("run", "--plan", "plan.jsonl", "--quiet")[0] == 0
+    Path("job.yaml").write_text(manifest.replace("/imu", "/gps/fix"))
+    assert ingest("plan", "job.yaml", "--check", "plan.jsonl")[0] == 1
