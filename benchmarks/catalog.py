@@ -24,7 +24,7 @@ sys.path.insert(0, str(ROOT / "tests/support"))
 
 from bucket_service import CONTROL, BucketService, bucket_service  # noqa: E402 - in the folder of the tests
 
-from mosaico_ingest.destinations.base import topic_schema  # noqa: E402 - after the other import
+from mosaico_ingest.destinations import topic_schema  # noqa: E402 - after the other import
 from mosaico_ingest.destinations.store import Store, StoreSink  # noqa: E402 - after the other import
 from mosaico_ingest.ontology.registry import OntologyType  # noqa: E402 - after the other import
 

@@ -14,7 +14,7 @@ from statistics import median
 import numpy as np
 import pyarrow as pa
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.compaction import compact
 from mosaico_ingest.job.values import Compression, IfExists

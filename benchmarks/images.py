@@ -16,8 +16,7 @@ from pathlib import Path
 import numpy as np
 from measure import run, typical
 
-from mosaico_ingest.images import RawImage
-from mosaico_ingest.images.files import encode_image
+from mosaico_ingest.images import RawImage, encode_image
 from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.job.values import Stores
 from mosaico_ingest.rosbag.blocks import Encoding

@@ -32,7 +32,7 @@ from mosaico_ingest.report.run import RunReport, UsedManifest
 from mosaico_ingest.version import __version__
 
 if TYPE_CHECKING:
-    from mosaico_ingest.executors.base import Executor
+    from mosaico_ingest.executors import Executor
     from mosaico_ingest.job.config import ROSInjectionConfig
     from mosaico_ingest.pipeline.plan import Plan
     from mosaico_ingest.pipeline.plan_document import Difference, PlanDocument, RecordingPlan
@@ -339,7 +339,7 @@ def run(
     from mosaico_ingest.pipeline.provenance import mark_known
 
     if executor is None:
-        from mosaico_ingest.executors.base import choose_executor
+        from mosaico_ingest.executors import choose_executor
 
         executor = choose_executor(tasks)
     tool = f"mosaico-ingest {__version__}"
@@ -363,7 +363,7 @@ def _refuse_shared_lines(tasks: LazySequence[Task]) -> None:
     """Raise ManifestError if several manifests write a sequence, whose recordings would share a line of the report."""
     if len(tasks.samples) < 2:  # noqa: PLR2004 - the names of one manifest differ
         return
-    from mosaico_ingest.destinations.base import destination_of
+    from mosaico_ingest.destinations import destination_of
 
     keys: set[tuple[str, str]] = set()
     for job in (task.job for task in tasks):

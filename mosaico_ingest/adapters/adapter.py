@@ -337,7 +337,7 @@ def without_files(rows: pa.StructArray) -> pa.StructArray:
 
 
 def _decoded(file: bytes) -> bytes:
-    from mosaico_ingest.images.files import decoded_buffer  # noqa: PLC0415 - only image files need it
+    from mosaico_ingest.images import decoded_buffer  # noqa: PLC0415 - only image files need it
 
     try:
         return decoded_buffer(file)

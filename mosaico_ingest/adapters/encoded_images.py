@@ -14,8 +14,7 @@ from msgspec.structs import replace
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.errors import ViewError
 from mosaico_ingest.findings import RowFailure
-from mosaico_ingest.images import RawImage
-from mosaico_ingest.images.files import EncodedImage, encode_image, require_pillow
+from mosaico_ingest.images import EncodedImage, RawImage, encode_image, require_pillow
 from mosaico_ingest.job.fields import ImageSettings
 from mosaico_ingest.ontology.registry import OntologyType
 

@@ -17,7 +17,7 @@ from rich.text import Text
 from mosaico_ingest.cli.console import PlainTable, Terminal
 from mosaico_ingest.cli.process import json_line
 from mosaico_ingest.display import bytes_text, count_text, counted, percent_text, seconds_text
-from mosaico_ingest.executors.base import source_bytes
+from mosaico_ingest.executors import source_bytes
 from mosaico_ingest.findings import one_line
 from mosaico_ingest.report.events import (
     BatchObserver,

@@ -47,7 +47,7 @@ from mosaico_ingest.lazy import LazySequence, concatenate
 from mosaico_ingest.report.events import SUCCESSFUL, BatchObserver, Event, RunFinished, ignore_batch
 
 if TYPE_CHECKING:
-    from mosaico_ingest.executors.base import Executor
+    from mosaico_ingest.executors import Executor
     from mosaico_ingest.job.model import Job
     from mosaico_ingest.pipeline.task import Task
     from mosaico_ingest.report.run import RunReport, UsedManifest
@@ -171,7 +171,7 @@ def run(
     """Ingest the recordings of job manifests, or exactly the decisions of a plan."""
     from mosaico_ingest import api
     from mosaico_ingest.display import counted
-    from mosaico_ingest.executors.base import choose_executor
+    from mosaico_ingest.executors import choose_executor
     from mosaico_ingest.pipeline.task import Task
 
     if bool(manifests) == (plan is not None):
@@ -372,7 +372,7 @@ def run_tasks(
     """
     from mosaico_ingest import api
     from mosaico_ingest.documents import check_output_file
-    from mosaico_ingest.executors.base import choose_executor
+    from mosaico_ingest.executors import choose_executor
 
     as_json = log_format is LogFormat.JSON
     level = log or ("ERROR" if quiet else tasks[0].job.run.log_level if tasks else "INFO")

@@ -11,8 +11,7 @@ import typer
 
 from mosaico_ingest.cli.console import PlainTable, Terminal, print_json, print_line
 from mosaico_ingest.cli.options import DEFAULT_STORE, JsonOption, StoreOption, write_output
-from mosaico_ingest.cli.store_pictures import image, plot
-from mosaico_ingest.cli.store_rows import describe, head, sample, sql, tail
+from mosaico_ingest.cli.store_rows import describe, head, image, plot, sample, sql, tail
 from mosaico_ingest.display import bytes_text, count_text, counted, seconds_text, time_text
 from mosaico_ingest.job.values import ATTACHMENTS_KEY, PROVENANCE_KEY, Compression
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from msgspec import Struct
 
-from mosaico_ingest.contracts.clauses import (
+from mosaico_ingest.contracts import (
     HEADER_KEYS,
     Clause,
     Contract,

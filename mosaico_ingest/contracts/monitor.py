@@ -11,7 +11,7 @@ import numpy as np
 import pyarrow as pa
 from msgspec import Struct, field
 
-from mosaico_ingest.contracts.clauses import ORDER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic
+from mosaico_ingest.contracts import ORDER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate, limit_result
 from mosaico_ingest.contracts.times import FileOrder, Gaps, Int64s, SlidingWindow, TopicTimes, read_events
 from mosaico_ingest.contracts.values import Batch

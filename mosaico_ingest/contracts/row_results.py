@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from math import inf
 from typing import TYPE_CHECKING, Any
 
-from mosaico_ingest.contracts.clauses import (
+from mosaico_ingest.contracts import (
     Clause,
     bounds_text,
     duration_text,

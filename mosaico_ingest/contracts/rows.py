@@ -29,7 +29,7 @@ from mosaico_ingest.adapters.mapping.columns import (
 )
 from mosaico_ingest.adapters.mapping.evaluator import Evaluation, RowsRejected
 from mosaico_ingest.adapters.mapping.expressions import TypedExpression
-from mosaico_ingest.contracts.clauses import HEADER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic, other_types
+from mosaico_ingest.contracts import HEADER_KEYS, ROW_KEYS, Clause, Contract, ReadTopic, other_types
 from mosaico_ingest.contracts.values import (
     Accumulator,
     AllowedValues,

@@ -14,7 +14,7 @@ from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.inverse import Inverse, invert
 from mosaico_ingest.adapters.mapping.columns import struct_of
 from mosaico_ingest.adapters.mapping.expressions import FieldAccess, TypedExpression
-from mosaico_ingest.contracts.clauses import Clause, Contract
+from mosaico_ingest.contracts import Clause, Contract
 from mosaico_ingest.contracts.evaluate import Facts, TopicFacts, evaluate
 from mosaico_ingest.contracts.monitor import TopicMonitor, referenced_topics, topic_monitor
 from mosaico_ingest.contracts.rows import RowMonitor, message_rows, ontology_rows, row_monitor

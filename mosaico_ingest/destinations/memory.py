@@ -11,7 +11,7 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     Session,
     StoredTopic,
     check_batch,

@@ -17,9 +17,9 @@ from multiprocessing.reduction import ForkingPickler
 import pyarrow as pa
 from msgspec import Struct, field, structs
 
-from mosaico_ingest.destinations.base import KeepOpen, keep_destinations_open
+from mosaico_ingest.destinations import KeepOpen, keep_destinations_open
 from mosaico_ingest.errors import IngestError, Interrupted
-from mosaico_ingest.executors.base import Batch, InProcess, Registrations, do_nothing
+from mosaico_ingest.executors import Batch, InProcess, Registrations, do_nothing
 from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.model import Job
 from mosaico_ingest.pipeline.run import failed_report

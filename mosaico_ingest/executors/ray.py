@@ -23,15 +23,15 @@ import pyarrow as pa
 from msgspec import Struct, structs
 
 from mosaico_ingest.adapters.builtin import BY_NAME
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.destinations.store.files import translate_errors
 from mosaico_ingest.errors import BagError, IngestError, Interrupted, SinkError
-from mosaico_ingest.executors.base import Batch, Registrations
+from mosaico_ingest.executors import Batch, Registrations
 from mosaico_ingest.executors.processes import ATTEMPTS
 from mosaico_ingest.interrupts import StopHandler, count_interrupts
 from mosaico_ingest.job.fields import AdapterRef, FilePath, PathRole, marked_fields, replace_values, values_at
 from mosaico_ingest.job.model import Job, JobSettings
-from mosaico_ingest.metadata.validation import schema_files
+from mosaico_ingest.metadata import schema_files
 from mosaico_ingest.pipeline.run import failed_report, run_recording
 from mosaico_ingest.pipeline.task import DEFAULT_BYTES, Task
 from mosaico_ingest.remote import is_url

@@ -254,7 +254,7 @@ class ServerTarget:
 
 
 class PluginTarget(Struct, frozen=True):
-    """A destination that an installed package provides; see `mosaico_ingest.destinations.base`."""
+    """A destination that an installed package provides; see `mosaico_ingest.destinations`."""
 
     kind: str
     """The name of its entry point."""

@@ -16,8 +16,7 @@ from msgspec import Struct
 
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.display import time_text
-from mosaico_ingest.images import Pixels
-from mosaico_ingest.images.files import jpeg_file
+from mosaico_ingest.images import Pixels, jpeg_file
 from mosaico_ingest.pages.design import pack
 from mosaico_ingest.view.columns import Column, is_list, is_number, topic_columns
 from mosaico_ingest.view.pictures import grid_step, has_images, png_bytes, thumbnails

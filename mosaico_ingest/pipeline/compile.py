@@ -31,8 +31,7 @@ from mosaico_ingest.job.validation import pattern_problems
 from mosaico_ingest.job.values import LOCK_SUFFIX, FileNamePattern, LockFile
 from mosaico_ingest.job.yaml_source import Source
 from mosaico_ingest.lazy import LazySequence, concatenate
-from mosaico_ingest.metadata.sources import source_spans, with_spans
-from mosaico_ingest.metadata.validation import read_json
+from mosaico_ingest.metadata import read_json, source_spans, with_spans
 from mosaico_ingest.protocol import is_sequence_name
 from mosaico_ingest.remote import AnyPath, RemotePath, with_network, without_options
 from mosaico_ingest.rosbag.discovery import SplitGroup, group_splits, has_split_number, recording_files

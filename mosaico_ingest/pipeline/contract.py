@@ -12,10 +12,10 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract
+from mosaico_ingest.contracts import TIME_KEYS, Contract
 from mosaico_ingest.contracts.monitor import BlockObserver, RecordingMonitor, summary
 from mosaico_ingest.decode.decoder import decoder_for
-from mosaico_ingest.destinations.base import AmendableSession, Session, destination_of
+from mosaico_ingest.destinations import AmendableSession, Session, destination_of
 from mosaico_ingest.errors import AdapterError, ContractError
 from mosaico_ingest.findings import Severity
 from mosaico_ingest.job.values import PROVENANCE_KEY, OnFailure

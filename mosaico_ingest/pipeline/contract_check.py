@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 
 from msgspec import structs
 
-from mosaico_ingest.contracts.clauses import TIME_KEYS, Contract, ReadTopic
+from mosaico_ingest.contracts import TIME_KEYS, Contract, ReadTopic
 from mosaico_ingest.contracts.evaluate import Member, group_results
 from mosaico_ingest.contracts.monitor import RecordingMonitor
 from mosaico_ingest.errors import IngestError, ManifestError

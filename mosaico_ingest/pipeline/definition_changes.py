@@ -14,7 +14,7 @@ from msgspec import Struct
 from pydantic import Field
 
 from mosaico_ingest.adapters.adapter import recorded_schema
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.display import counted
 from mosaico_ingest.documents import Part, read_document
 from mosaico_ingest.errors import ContractError, IngestError

@@ -14,8 +14,8 @@ from typing_extensions import TypedDict
 
 from mosaico_ingest.adapters.adapter import RESERVED_KEYS, AdapterSpec, EncodedImageSpec
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.contracts.clauses import Contract, ReadTopic
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.contracts import Contract, ReadTopic
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.display import count_text, counted
 from mosaico_ingest.documents import Part, Unchecked, html_table
 from mosaico_ingest.findings import Finding, Span, escape_undecodable

@@ -13,8 +13,8 @@ from msgspec import Struct
 from mosaico_ingest.adapters.adapter import IMAGE_TAG, UnmodeledSpec, source_metadata
 from mosaico_ingest.adapters.bridge import Resolution, ROSBridge, outputs_of
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
-from mosaico_ingest.contracts.clauses import Contract
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.contracts import Contract
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.display import bytes_text, counted
 from mosaico_ingest.errors import AdapterError, BagError, IngestError, NothingMatched
 from mosaico_ingest.findings import Finding, Severity, Span, escape_undecodable, suggest_names
@@ -180,7 +180,7 @@ def _with_metadata(job: Job, recording: Recording) -> tuple[Job, tuple[Finding, 
     """Return the job with the metadata from `metadata_from`, and findings about it."""
     if job.sequence.metadata_from is None:
         return job, ()
-    from mosaico_ingest.metadata.sources import fill_in_metadata  # noqa: PLC0415 - it loads the YAML parser
+    from mosaico_ingest.metadata import fill_in_metadata  # noqa: PLC0415 - it loads the YAML parser
 
     return fill_in_metadata(job, recording)
 
@@ -219,7 +219,7 @@ def _check_metadata(job: Job, topics: Iterable[TopicPlan]) -> None:
     settings = job.topic_settings.values()
     if job.sequence.metadata_schema is None and all(entry.metadata_schema is None for entry in settings):
         return
-    from mosaico_ingest.metadata.validation import check_metadata_contracts  # noqa: PLC0415 - it loads the YAML parser
+    from mosaico_ingest.metadata import check_metadata_contracts  # noqa: PLC0415 - it loads the YAML parser
 
     check_metadata_contracts(job, dict.fromkeys(topic.topic for topic in topics))
 

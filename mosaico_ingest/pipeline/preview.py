@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.contracts.monitor import RecordingMonitor
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     ExistingSequence,
     Session,
     StoredTopic,

@@ -26,7 +26,7 @@ from mosaico_ingest.adapters.adapter import AdapterSpec
 from mosaico_ingest.adapters.bridge import adapter_spec, installed_adapters
 from mosaico_ingest.adapters.mapping.loader import MappingSpec
 from mosaico_ingest.adapters.python import PythonAdapterSpec, ontology_of, registered_adapters
-from mosaico_ingest.destinations.base import ExistingSequence, destination_of
+from mosaico_ingest.destinations import ExistingSequence, destination_of
 from mosaico_ingest.errors import BagError, IngestError, SequenceExists
 from mosaico_ingest.findings import escape_undecodable
 from mosaico_ingest.job.fields import reference_of

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, cast
 
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     AmendableSink,
     AttachableSession,
     Attached,

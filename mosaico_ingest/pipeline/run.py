@@ -11,7 +11,7 @@ from functools import partial
 from msgspec import Struct
 
 from mosaico_ingest.adapters.bridge import ROSBridge
-from mosaico_ingest.destinations.base import Sink, destination_of
+from mosaico_ingest.destinations import Sink, destination_of
 from mosaico_ingest.errors import ContractError, IngestError, Interrupted
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.interrupts import DeferredInterrupt

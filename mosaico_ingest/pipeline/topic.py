@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from mosaico_ingest.adapters.adapter import Adapted, Adapter, Envelope
 from mosaico_ingest.decode.decoder import Decoder, decoder_for
-from mosaico_ingest.destinations.base import ENVELOPE, Session, TopicWriter
+from mosaico_ingest.destinations import ENVELOPE, Session, TopicWriter
 from mosaico_ingest.errors import AdapterError, BagError, DecodeError, IngestError, SinkError
 from mosaico_ingest.findings import RowFailure, Stage
 from mosaico_ingest.job.values import LoaderErrorPolicy, TopicLevelErrorPolicy

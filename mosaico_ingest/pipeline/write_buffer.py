@@ -10,7 +10,7 @@ from types import TracebackType
 import pyarrow as pa
 from typing_extensions import Self
 
-from mosaico_ingest.destinations.base import TopicWriter
+from mosaico_ingest.destinations import TopicWriter
 
 _INTERRUPTED_S = 20.0
 """Seconds to wait for the writing thread after an interrupt: the destination may not respond."""

@@ -15,7 +15,7 @@ import pyarrow as pa
 import pyarrow.flight as fl
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import ENVELOPE, validated, with_offsets
+from mosaico_ingest.destinations import ENVELOPE, validated, with_offsets
 from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.destinations.store.model import SequenceInfo, SessionInfo, TopicInfo
 from mosaico_ingest.destinations.store.session import StoreSession, StoreTopic

@@ -10,7 +10,7 @@ from typing import Any
 from msgspec import Struct
 from msgspec.structs import replace
 
-from mosaico_ingest.contracts.clauses import Contract
+from mosaico_ingest.contracts import Contract
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.manifest import check_manifest, read_manifest, refusal

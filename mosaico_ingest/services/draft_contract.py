@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mosaico_ingest.adapters.adapter import Envelope
 from mosaico_ingest.adapters.bridge import ROSBridge
 from mosaico_ingest.adapters.mapping.columns import is_number
-from mosaico_ingest.contracts.clauses import duration_text, number_text
+from mosaico_ingest.contracts import duration_text, number_text
 from mosaico_ingest.contracts.monitor import TopicMonitor
 from mosaico_ingest.contracts.rows import Evaluator, FieldExpression, bind_expression, message_rows
 from mosaico_ingest.contracts.values import Values

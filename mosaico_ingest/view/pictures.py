@@ -28,12 +28,15 @@ from mosaico_ingest.images import (
     depth_parameters,
     depth_payload,
     eight_bits,
+    file_samples,
     gray,
+    image_file_type,
     is_bayer,
+    picture_of,
+    pillow,
     raw_pixels,
     run_length_depth,
 )
-from mosaico_ingest.images.files import file_samples, image_file_type, picture_of, pillow
 from mosaico_ingest.view.rows import column_schema, last_rows, nearest_row, rows_near
 
 _GAP = 4

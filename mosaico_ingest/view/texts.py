@@ -17,7 +17,7 @@ from msgspec import Struct
 from mosaico_ingest.destinations.store.model import TopicInfo
 from mosaico_ingest.destinations.store.store import Window, scan
 from mosaico_ingest.display import bytes_text, count_text, counted, time_text
-from mosaico_ingest.images.files import image_file_type
+from mosaico_ingest.images import image_file_type
 from mosaico_ingest.view.rows import column_schema
 
 if TYPE_CHECKING:

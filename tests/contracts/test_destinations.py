@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from mosaico_ingest.api import compile_job, run
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.values import PluginTarget, ServerTarget, StoreTarget
 

@@ -18,7 +18,7 @@ from mosaico_ingest.adapters.python import ROSAdapterBase
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.destination import StoreDestination
 from mosaico_ingest.destinations.store.session import StoreSession
-from mosaico_ingest.executors.base import Executor, InProcess, do_nothing
+from mosaico_ingest.executors import Executor, InProcess, do_nothing
 from mosaico_ingest.executors.processes import Processes, _spawn_worker
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.ontology import IMU, Vector3d

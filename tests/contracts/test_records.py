@@ -9,7 +9,7 @@ import pyarrow as pa
 import pytest
 from object_store import ObjectStore
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.files import NotInStore, new_session_id
 from mosaico_ingest.destinations.store.model import NewNote, NewSession, NewTopic, StoreCatalog

@@ -12,7 +12,7 @@ import pytest
 from mosaicod import Mosaicod, running
 from object_store import ObjectStore
 
-from mosaico_ingest.destinations.base import AmendableSession, Sink, topic_schema
+from mosaico_ingest.destinations import AmendableSession, Sink, topic_schema
 from mosaico_ingest.destinations.memory import MemorySink
 from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.destinations.store import Store, StoreSink

@@ -10,11 +10,11 @@ from typing import Any
 
 import pytest
 
+from mosaico_ingest import executors as groups
 from mosaico_ingest.destinations.store import Store, files, session
 from mosaico_ingest.destinations.store.catalog import Catalog
 from mosaico_ingest.errors import SinkError
-from mosaico_ingest.executors import base as groups
-from mosaico_ingest.executors.base import InProcess
+from mosaico_ingest.executors import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import CommitStarted, Event, RunFinished, RunStatus, ignore_batch

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.destinations.base import keep_destinations_open
+from mosaico_ingest.destinations import keep_destinations_open
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store import sqlite as connections
 from mosaico_ingest.errors import SequenceExists
-from mosaico_ingest.executors.base import InProcess
+from mosaico_ingest.executors import InProcess
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.task import Task
 

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from mosaico_ingest.executors import base as groups
-from mosaico_ingest.executors.base import Batch
+from mosaico_ingest import executors as groups
+from mosaico_ingest.executors import Batch
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.pipeline.task import Task
 from mosaico_ingest.report.events import ignore_batch

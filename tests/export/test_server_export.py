@@ -25,7 +25,7 @@ from rosbags.typesys import get_typestore
 from mosaico_ingest.adapters.builtin import BUILTIN, Builtin
 from mosaico_ingest.adapters.standalone import DefinitionFinder
 from mosaico_ingest.api import run
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.errors import BagError, NothingMatched, SinkError

@@ -15,8 +15,7 @@ from hypothesis import strategies as st
 from PIL import Image
 
 from mosaico_ingest.errors import ViewError
-from mosaico_ingest.images import RawImage
-from mosaico_ingest.images.files import EncodedImage, decoded_buffer, encode_image
+from mosaico_ingest.images import EncodedImage, RawImage, decoded_buffer, encode_image
 from mosaico_ingest.job.fields import ImageSettings
 
 HEIGHT, WIDTH = 12, 18

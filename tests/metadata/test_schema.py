@@ -9,7 +9,7 @@ import pytest
 
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.yaml_source import load_source
-from mosaico_ingest.metadata.validation import Spans, load_schema, schema_files, violations
+from mosaico_ingest.metadata import Spans, load_schema, schema_files, violations
 
 
 def findings_of(folder: Path, schema: object, text: str) -> list[tuple[str, int, int]]:

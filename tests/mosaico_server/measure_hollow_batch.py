@@ -12,7 +12,7 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "support"))
 
 from hollow_batches import hollow_batch
 
-from mosaico_ingest.destinations.base import validated
+from mosaico_ingest.destinations import validated
 
 schema = pa.schema([("timestamp_ns", pa.int64()), ("a", pa.list_(pa.list_(pa.list_(pa.int8()))))])
 stream = io.BytesIO()

@@ -15,7 +15,7 @@ import pytest
 from hollow_batches import hollow_batch, malformed_batch
 from mosaicod import Mosaicod, Topic, running
 
-from mosaico_ingest.destinations.base import destination_of, has_nested_lists, topic_schema, validated
+from mosaico_ingest.destinations import destination_of, has_nested_lists, topic_schema, validated
 from mosaico_ingest.destinations.server.client import connect
 from mosaico_ingest.destinations.server.destination import ServerSink
 from mosaico_ingest.errors import SinkError, SinkUnavailable

@@ -16,7 +16,7 @@ import pyarrow.flight as fl
 import pytest
 from mosaicod import Mosaicod, Proxy, exists, make_key, precondition, running
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.server.client import Address, connect
 from mosaico_ingest.destinations.server.destination import ServerDestination, ServerSink
 from mosaico_ingest.destinations.server.session import ServerSession

@@ -21,7 +21,7 @@ from store_formats import make_format_1
 
 from mosaico_ingest import api
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.destinations.base import Session, StoredTopic, TopicWriter
+from mosaico_ingest.destinations import Session, StoredTopic, TopicWriter
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.destination import StoreDestination
 from mosaico_ingest.destinations.store.store import verify
@@ -295,7 +295,7 @@ def test_run_interrupted_during_commit_finishes_it_unless_interrupted_twice(
 ) -> None:
     interrupt_commits(monkeypatch, signals=signals)
     monkeypatch.setattr("mosaico_ingest.destinations.store.destination._MAX_COMMITS", group)
-    monkeypatch.setattr("mosaico_ingest.executors.base._MAX_S", 60.0)
+    monkeypatch.setattr("mosaico_ingest.executors._MAX_S", 60.0)
     configs = [ROSInjectionConfig(DRIVE, name, store=tmp_path / "store") for name in ("a", "b", "c")]
     reports = api.run(configs).recordings
     earlier = RunStatus.COMPLETED if signals == 1 else RunStatus.INTERRUPTED

@@ -14,7 +14,7 @@ import pytest
 from made_recordings import define, record
 from object_store import ObjectStore, object_store
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.compaction import compact
 from mosaico_ingest.destinations.store.session import StoreTopic

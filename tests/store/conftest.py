@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from flight_calls import Client
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.ontology.registry import OntologyType
 from mosaico_ingest.serve import Server, serve

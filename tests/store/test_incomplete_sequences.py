@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.destinations.base import destination_of
+from mosaico_ingest.destinations import destination_of
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.job.values import StoreTarget
 from mosaico_ingest.ontology.registry import OntologyType

@@ -10,7 +10,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.segment import Columns, SegmentWriter
 from mosaico_ingest.ontology.registry import OntologyType

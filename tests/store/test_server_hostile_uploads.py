@@ -7,7 +7,7 @@ import pytest
 from flight_calls import Client, descriptor_of, refused
 from hollow_batches import hollow_batch, malformed_batch
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store
 from mosaico_ingest.destinations.store.store import verify
 from mosaico_ingest.ontology.registry import MODULES, OntologyType, ontology_type

@@ -8,7 +8,7 @@ from typing import cast
 import numpy as np
 import pyarrow as pa
 
-from mosaico_ingest.destinations.base import Session, topic_schema
+from mosaico_ingest.destinations import Session, topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.destinations.store.session import StoreSession, commit_sessions
 from mosaico_ingest.job.values import IfExists

@@ -9,7 +9,7 @@ from typing import Any
 import pyarrow as pa
 
 from mosaico_ingest import api
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink
 from mosaico_ingest.ontology.registry import OntologyType
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, StoreSink, TopicInfo
 from mosaico_ingest.job.values import IfExists
 from mosaico_ingest.ontology.registry import OntologyType

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mosaico_ingest.destinations.base import topic_schema
+from mosaico_ingest.destinations import topic_schema
 from mosaico_ingest.destinations.store import Store, TopicInfo
 from mosaico_ingest.ontology.registry import UNITS, OntologyType, builtin_type, column_unit
 from mosaico_ingest.view import columns as view_statistics

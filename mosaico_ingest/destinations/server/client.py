@@ -23,7 +23,7 @@ import pyarrow.compute as pc
 import pyarrow.flight as fl
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import validated
+from mosaico_ingest.destinations import validated
 from mosaico_ingest.errors import IngestError, SinkError, SinkUnavailable
 from mosaico_ingest.job.values import DEFAULT_PORT, ServerTarget
 from mosaico_ingest.ontology.registry import SerializationFormat

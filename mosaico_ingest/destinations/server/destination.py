@@ -10,7 +10,7 @@ from typing import Any, ClassVar
 from msgspec import Struct
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     Destination,
     DestinationStatus,
     ExistingSequence,

@@ -18,7 +18,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     StoredTopic,
     TopicWriter,
     check_batch,

@@ -20,7 +20,7 @@ from typing import Any
 
 import pyarrow as pa
 
-from mosaico_ingest.destinations.base import FamilyTopic, check_same_type, sequence_exists
+from mosaico_ingest.destinations import FamilyTopic, check_same_type, sequence_exists
 from mosaico_ingest.destinations.store import sqlite
 from mosaico_ingest.destinations.store.files import NotInStore, sequence_changed, translate_errors
 from mosaico_ingest.destinations.store.model import (

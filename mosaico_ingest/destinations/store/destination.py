@@ -10,7 +10,7 @@ from os.path import normpath, relpath
 from pathlib import Path
 from typing import ClassVar, cast
 
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     Destination,
     DestinationStatus,
     ExistingSequence,

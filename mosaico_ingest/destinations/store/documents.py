@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 from msgspec import Struct
 from pydantic import BaseModel, ConfigDict
 
-from mosaico_ingest.destinations.base import check_same_type, sequence_exists
+from mosaico_ingest.destinations import check_same_type, sequence_exists
 from mosaico_ingest.destinations.store.files import (
     CHANGES,
     NotInStore,

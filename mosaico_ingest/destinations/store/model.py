@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import pyarrow as pa
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import FamilyTopic
+from mosaico_ingest.destinations import FamilyTopic
 from mosaico_ingest.destinations.store.files import NotInStore
 from mosaico_ingest.destinations.store.segment import Segment, combined
 from mosaico_ingest.display import bytes_text, count_text, counted, seconds_text, time_text

@@ -39,7 +39,7 @@ from urllib.parse import unquote
 import msgspec
 from msgspec import Struct
 
-from mosaico_ingest.destinations.base import FamilyTopic, sequence_exists
+from mosaico_ingest.destinations import FamilyTopic, sequence_exists
 from mosaico_ingest.destinations.store.documents import (
     DOCUMENT,
     FORMAT,

@@ -15,7 +15,7 @@ from msgspec import Struct
 from numpy.typing import NDArray
 from xxhash import xxh3_128, xxh3_128_digest
 
-from mosaico_ingest.destinations.base import has_nested_lists, topic_schema
+from mosaico_ingest.destinations import has_nested_lists, topic_schema
 from mosaico_ingest.destinations.store import files
 from mosaico_ingest.job.values import Compression
 from mosaico_ingest.lazy import cache_by_identity

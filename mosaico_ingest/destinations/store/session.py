@@ -19,7 +19,7 @@ from msgspec import Struct
 from xxhash import xxh3_128
 
 from mosaico_ingest import protocol
-from mosaico_ingest.destinations.base import (
+from mosaico_ingest.destinations import (
     Attached,
     Session,
     StoredTopic,

@@ -19,7 +19,7 @@ from threading import Lock
 import pyarrow as pa
 from xxhash import xxh3_128_hexdigest
 
-from mosaico_ingest.destinations.base import FamilyTopic
+from mosaico_ingest.destinations import FamilyTopic
 from mosaico_ingest.destinations.store.model import (
     Listing,
     Note,

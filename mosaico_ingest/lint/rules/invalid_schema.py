@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from mosaico_ingest.errors import ManifestError
 from mosaico_ingest.job.fields import PathRole
 from mosaico_ingest.lint.check import Check, Job, Problem, manifest_paths
-from mosaico_ingest.metadata.validation import load_schema
+from mosaico_ingest.metadata import load_schema
 
 
 def check(job: Job) -> Iterator[Problem]:

@@ -12,13 +12,13 @@ from mosaico_ingest.job.model import Manifest, combined_settings
 from mosaico_ingest.job.values import is_glob
 from mosaico_ingest.job.yaml_source import KeyPath, Source
 from mosaico_ingest.lint.check import Check, Job, Problem, manifests_of_matrix
-from mosaico_ingest.metadata.sources import source_spans
-from mosaico_ingest.metadata.validation import (
+from mosaico_ingest.metadata import (
     MetadataSchema,
     Spans,
     Violation,
     load_schema,
     read_json,
+    source_spans,
     topic_section,
     violations,
 )
