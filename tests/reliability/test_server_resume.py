@@ -156,7 +156,8 @@ def kill_and_look(job: Path, folder: Path, rounds: int) -> tuple[int, int]:
         whole, nothing = whole + (rows == ROWS), nothing + (rows == 0)
         code, output = ran("run", job)
         assert code == 0, output
-        assert ("it already has the same content" in output) == (rows == ROWS)
+        # Without rows the server may have received the last request, and commits after the store was read.
+        assert rows == 0 or "it already has the same content" in output
         assert speeds(folder) == [1.0] * ROWS
         assert ran("run", job)[0] == 0
         assert ran("store", "rm", "drive", "--yes", "--store", folder / "served")[0] == 0
