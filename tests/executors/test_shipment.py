@@ -10,9 +10,12 @@ import pytest
 
 from mosaico_ingest.api import compile_job
 from mosaico_ingest.cli.app import main
-from mosaico_ingest.executors.ray import absolute, pack
 from mosaico_ingest.pipeline.run import make_plan
 from mosaico_ingest.pipeline.task import Task
+
+pytest.importorskip("ray", reason="Ray is not installed")
+
+from mosaico_ingest.executors.ray import absolute, pack
 
 QUICKSTART = Path(__file__).resolve().parents[2] / "configs" / "quickstart"
 PYTHON = """

@@ -16,7 +16,6 @@ from rosbags.typesys import Stores, get_typestore
 
 from mosaico_ingest import api
 from mosaico_ingest.errors import ContractError, IngestError, ManifestError
-from mosaico_ingest.executors.ray import absolute, pack
 from mosaico_ingest.findings import Finding
 from mosaico_ingest.job.config import ROSInjectionConfig
 from mosaico_ingest.lint.engine import lint_paths
@@ -337,6 +336,9 @@ def test_status_after_changed_schema_is_done(tmp_path: Path) -> None:
 
 
 def test_pack_copies_schema_with_its_references(tmp_path: Path) -> None:
+    pytest.importorskip("ray", reason="Ray is not installed")
+    from mosaico_ingest.executors.ray import absolute, pack  # noqa: PLC0415 - it imports Ray
+
     write(tmp_path / "in" / "r1_7.mcap")
     (tmp_path / "in" / "word.json").write_text('{"type": "string"}')
     schema = {"properties": {"vehicle": {"$ref": "word.json"}}}
